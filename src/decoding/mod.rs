@@ -1,0 +1,1 @@
+//! Iterative parallel decoding: schedules, guidance, nucleus sampling, samplers (Supp. C).

@@ -1,0 +1,1 @@
+//! Reading released weights of others without executing anything.

@@ -1,0 +1,1 @@
+//! The Masked Generative Egocentric Transformer (Sec. 4.3, Supp. B).

@@ -1,0 +1,1 @@
+//! The ops of the experiment language: one file per op, with its settings, its ports and what it runs.

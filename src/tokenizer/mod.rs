@@ -1,0 +1,59 @@
+//! Tokenizers: every modality becomes a grid of discrete tokens and back (Sec. 4.2, Supp. A).
+
+use crate::clip::Signal;
+
+/// The tokens of one clip and modality.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct TokenGrid {
+    /// Row-major over `grid`, each below the tokenizer's vocabulary.
+    pub ids: Vec<u32>,
+    /// Camera and gaze `[30]`, body and hands `[30, 7]`, video `[5, 32, 32]` at the paper's sizes.
+    pub grid: Vec<usize>,
+}
+
+/// Turns signals of one modality into tokens and back.
+pub trait Tokenizer: Send + Sync {
+    /// The modality it was trained for.
+    fn modality(&self) -> &str;
+    /// The shape of a token grid.
+    fn grid(&self) -> &[usize];
+    /// How many different tokens there are.
+    fn vocabulary(&self) -> usize;
+    /// Tokens of a batch of signals, in order.
+    ///
+    /// # Errors
+    /// When a signal has another shape than the tokenizer was built for, or a value that is valid and not finite.
+    fn encode(&self, signals: &[Signal]) -> Result<Vec<TokenGrid>, TokenizerError>;
+    /// Signals of a batch of token grids, de-normalised, in order.
+    ///
+    /// # Errors
+    /// When a grid has another shape, or a token is outside the vocabulary.
+    fn decode(&self, tokens: &[TokenGrid]) -> Result<Vec<Signal>, TokenizerError>;
+}
+
+/// Why a tokenizer refuses its input.
+#[derive(Debug, thiserror::Error)]
+pub enum TokenizerError {
+    #[error("{modality}: signal {index} has shape {found:?}, expected {expected:?}")]
+    Shape {
+        modality: String,
+        index: usize,
+        found: Vec<usize>,
+        expected: Vec<usize>,
+    },
+    #[error("{modality}: signal {index} holds a value that is not finite at {position:?}")]
+    NotFinite {
+        modality: String,
+        index: usize,
+        position: Vec<usize>,
+    },
+    #[error("{modality}: token {token} of grid {index} is outside the vocabulary of {vocabulary}")]
+    Vocabulary {
+        modality: String,
+        index: usize,
+        token: u32,
+        vocabulary: usize,
+    },
+    #[error("{0}")]
+    Other(String),
+}

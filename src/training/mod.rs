@@ -1,0 +1,1 @@
+//! Training that can be trusted: step, schedule, optimizer, checkpoints (Supp. B).
