@@ -1,5 +1,7 @@
 //! Tokenizers: every modality becomes a grid of discrete tokens and back (Sec. 4.2, Supp. A).
 
+pub mod quantizer;
+
 use crate::clip::Signal;
 
 /// The tokens of one clip and modality.

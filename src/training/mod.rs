@@ -1,1 +1,7 @@
 //! Training that can be trusted: step, schedule, optimizer, checkpoints (Supp. B).
+
+pub mod optimizer;
+pub mod schedule;
+
+pub use optimizer::{AdamW, AdamWSettings};
+pub use schedule::Schedule;

@@ -1,0 +1,93 @@
+//! Gradients by parameter name.
+
+use std::collections::BTreeMap;
+
+use burn::tensor::Tensor;
+
+use super::ops;
+use super::parameters::Parameters;
+
+/// One flat gradient per trainable parameter of a model. A parameter that took no part has a gradient of zeros, as in the
+/// reference: momentum and weight decay still move it.
+#[derive(Debug, Clone, Default)]
+pub struct Gradients {
+    by_name: BTreeMap<String, Tensor<1>>,
+}
+
+impl Gradients {
+    /// Gradients of `loss` (one element) in every tracked parameter of `model`.
+    ///
+    /// # Panics
+    /// When `loss` does not depend on any tracked parameter.
+    pub fn of<M: Parameters + ?Sized>(loss: &Tensor<1>, model: &M) -> Self {
+        let mut tape = loss.backward();
+        let mut by_name = BTreeMap::new();
+        model.visit("", &mut |name, parameter| {
+            if parameter.is_tracked() {
+                let leaf = parameter.flat();
+                let gradient = leaf
+                    .grad_remove(&mut tape)
+                    .unwrap_or_else(|| parameter.untracked().zeros_like());
+                by_name.insert(name.to_owned(), gradient);
+            }
+        });
+        Self { by_name }
+    }
+
+    /// From flat tensors by name.
+    #[must_use]
+    pub fn from_map(by_name: BTreeMap<String, Tensor<1>>) -> Self {
+        Self { by_name }
+    }
+
+    /// The gradient of one parameter, flat.
+    #[must_use]
+    pub fn get(&self, name: &str) -> Option<&Tensor<1>> {
+        self.by_name.get(name)
+    }
+
+    /// Takes the gradient of one parameter out.
+    pub fn remove(&mut self, name: &str) -> Option<Tensor<1>> {
+        self.by_name.remove(name)
+    }
+
+    /// All gradients in the order of names.
+    pub fn iter(&self) -> impl Iterator<Item = (&str, &Tensor<1>)> {
+        self.by_name
+            .iter()
+            .map(|(name, tensor)| (name.as_str(), tensor))
+    }
+
+    /// Adds `other`, a gradient of the same model (gradient accumulation, sums over devices).
+    ///
+    /// # Panics
+    /// When the names differ.
+    #[must_use]
+    pub fn plus(mut self, mut other: Self) -> Self {
+        assert_eq!(self.by_name.len(), other.by_name.len());
+        for (name, tensor) in &mut self.by_name {
+            let more = other
+                .by_name
+                .remove(name)
+                .expect("gradients of the same model");
+            tensor.inplace(|sum| sum + more);
+        }
+        self
+    }
+
+    /// The Euclidean norm over all gradients together.
+    #[must_use]
+    pub fn norm(&self) -> f64 {
+        self.by_name
+            .values()
+            .map(|tensor| ops::sum_of_squares(tensor.clone()))
+            .sum::<f64>()
+            .sqrt()
+    }
+
+    /// The factor that brings a gradient of norm `norm` down to `max_norm`: `min(1, max_norm / (norm + 1e-6))`.
+    #[must_use]
+    pub fn clip_factor(norm: f64, max_norm: f64) -> f64 {
+        (max_norm / (norm + 1e-6)).min(1.0)
+    }
+}

@@ -1,0 +1,125 @@
+//! The operations models are made of, on packed tokens: `[tokens, width]` without padding, samples one after the other.
+//!
+//! Shape suffixes: `N` tokens, `D` width, `V` vocabulary, `H` heads. All values f32. Weights are `[out, in]`, as in
+//! checkpoints.
+
+mod composed;
+mod gemm;
+mod nearest;
+
+pub use nearest::nearest;
+
+use burn::tensor::{Int, Tensor, TensorData};
+
+use super::Segments;
+
+/// `x W^T + b`; `x` is `[N, in]`, `weight` `[out, in]`.
+#[must_use]
+pub fn linear(x: Tensor<2>, weight: Tensor<2>, bias: Option<Tensor<1>>) -> Tensor<2> {
+    composed::linear(x, weight, bias)
+}
+
+/// Each row to mean 0 and variance 1 (biased, plus `epsilon`), times `weight`, plus `bias`.
+#[must_use]
+pub fn layer_norm(
+    x: Tensor<2>,
+    weight: Tensor<1>,
+    bias: Option<Tensor<1>>,
+    epsilon: f64,
+) -> Tensor<2> {
+    composed::layer_norm(x, weight, bias, epsilon)
+}
+
+/// Self-attention within segments. `qkv` is `[N, 3 D]` in the layout `[3][heads][D / heads]`; scores are scaled by
+/// `(D / heads)^-0.5`. Gives `[N, D]`, `[heads][D / heads]`.
+#[must_use]
+pub fn self_attention(qkv: Tensor<2>, heads: usize, segments: &Segments) -> Tensor<2> {
+    composed::self_attention(qkv, heads, segments)
+}
+
+/// Cross-attention within segments. `q` is `[N, D]`, `kv` `[M, 2 D]` in the layout `[2][heads][D / heads]`. A segment without
+/// keys gives zeros.
+#[must_use]
+pub fn cross_attention(
+    q: Tensor<2>,
+    kv: Tensor<2>,
+    heads: usize,
+    segments: &Segments,
+) -> Tensor<2> {
+    composed::cross_attention(q, kv, heads, segments)
+}
+
+/// `x Phi(x)` with the exact (erf) normal distribution function.
+#[must_use]
+pub fn gelu<const D: usize>(x: Tensor<D>) -> Tensor<D> {
+    burn::tensor::activation::gelu(x)
+}
+
+/// `silu(gate) * value`, element by element.
+#[must_use]
+pub fn swiglu(gate: Tensor<2>, value: Tensor<2>) -> Tensor<2> {
+    burn::tensor::activation::silu(gate) * value
+}
+
+/// `-log softmax(logits)[target]` of each row: `[N]`. `logits` is `[N, V]`.
+#[must_use]
+pub fn cross_entropy(logits: Tensor<2>, targets: &[u32]) -> Tensor<1> {
+    composed::cross_entropy(logits, targets)
+}
+
+/// [`cross_entropy`] of the logits `x table^T`, without keeping all of them: `x` is `[N, D]`, `table` `[V, D]`. Gives `[N]`.
+#[must_use]
+pub fn tied_cross_entropy(x: Tensor<2>, table: Tensor<2>, targets: &[u32]) -> Tensor<1> {
+    cross_entropy(linear(x, table, None), targets)
+}
+
+/// The rows `ids` of `table` `[V, D]`: `[N, D]`.
+#[must_use]
+pub fn embedding(table: Tensor<2>, ids: &[u32]) -> Tensor<2> {
+    let ids = indices(ids, &table);
+    table.select(0, ids)
+}
+
+/// Row numbers as a tensor on the device of `like`.
+#[must_use]
+pub fn indices(ids: &[u32], like: &Tensor<2>) -> Tensor<1, Int> {
+    let values: Vec<i64> = ids.iter().map(|id| i64::from(*id)).collect();
+    let length = values.len();
+    Tensor::from_data(
+        TensorData::new(values, [length]),
+        &like.device().without_autodiff(),
+    )
+}
+
+/// The sum of squares of all elements.
+#[must_use]
+pub fn sum_of_squares(x: Tensor<1>) -> f64 {
+    composed::sum_of_squares(x)
+}
+
+/// The scalars of one AdamW step of one parameter, bias corrections included.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct AdamWStep {
+    /// Gradients are multiplied by this first (clipping).
+    pub gradient_scale: f64,
+    pub betas: [f64; 2],
+    pub epsilon: f64,
+    /// Learning rate times weight decay.
+    pub decay: f64,
+    /// Learning rate divided by the correction of the mean.
+    pub rate: f64,
+    /// What the root of the mean square is multiplied by.
+    pub square_correction: f64,
+}
+
+/// One AdamW step: new `(values, mean, square)`, in place where nobody else holds them.
+#[must_use]
+pub fn adamw(
+    values: Tensor<1>,
+    gradient: Tensor<1>,
+    mean: Tensor<1>,
+    square: Tensor<1>,
+    step: AdamWStep,
+) -> (Tensor<1>, Tensor<1>, Tensor<1>) {
+    composed::adamw(values, gradient, mean, square, step)
+}

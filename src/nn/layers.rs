@@ -1,0 +1,138 @@
+//! Linear, layer norm and the two feed-forward layers.
+
+use burn::tensor::Tensor;
+
+use crate::engine::{Initialise, Parameter, ops, parameters};
+
+/// Layer norms add this to the variance.
+pub const EPSILON: f64 = 1e-6;
+
+/// `x W^T + b`.
+#[derive(Debug, Clone)]
+pub struct Linear {
+    /// `[out, in]`.
+    pub weight: Parameter,
+    /// `[out]`.
+    pub bias: Option<Parameter>,
+}
+parameters!(Linear { weight, bias });
+
+impl Linear {
+    /// Xavier-uniform weight; the bias, if any, is 0.
+    #[must_use]
+    pub fn new(place: &Initialise<'_>, inputs: usize, outputs: usize, bias: bool) -> Self {
+        Self::packed(place, inputs, outputs, 1, bias)
+    }
+
+    /// `parts` linear layers of `outputs / parts` outputs each, stored as one (qkv, kv): initialised as if separate.
+    #[must_use]
+    pub fn packed(
+        place: &Initialise<'_>,
+        inputs: usize,
+        outputs: usize,
+        parts: usize,
+        bias: bool,
+    ) -> Self {
+        Self {
+            weight: place.xavier("weight", &[outputs, inputs], inputs, outputs / parts),
+            bias: bias.then(|| place.constant(&[outputs], 0.0)),
+        }
+    }
+
+    /// `[N, in]` to `[N, out]`.
+    #[must_use]
+    pub fn forward(&self, x: Tensor<2>) -> Tensor<2> {
+        ops::linear(
+            x,
+            self.weight.tensor(),
+            self.bias.as_ref().map(Parameter::tensor),
+        )
+    }
+}
+
+/// Layer norm with a weight and, in the tokenizers, a bias.
+#[derive(Debug, Clone)]
+pub struct LayerNorm {
+    pub weight: Parameter,
+    pub bias: Option<Parameter>,
+}
+parameters!(LayerNorm { weight, bias });
+
+impl LayerNorm {
+    /// Weight 1, bias 0.
+    #[must_use]
+    pub fn new(place: &Initialise<'_>, width: usize, bias: bool) -> Self {
+        Self {
+            weight: place.constant(&[width], 1.0),
+            bias: bias.then(|| place.constant(&[width], 0.0)),
+        }
+    }
+
+    /// `[N, D]` to `[N, D]`.
+    #[must_use]
+    pub fn forward(&self, x: Tensor<2>) -> Tensor<2> {
+        ops::layer_norm(
+            x,
+            self.weight.tensor(),
+            self.bias.as_ref().map(Parameter::tensor),
+            EPSILON,
+        )
+    }
+}
+
+/// `fc2(gelu(fc1 x))`, or with tanh instead of GELU.
+#[derive(Debug, Clone)]
+pub struct Mlp {
+    pub fc1: Linear,
+    pub fc2: Linear,
+}
+parameters!(Mlp { fc1, fc2 });
+
+impl Mlp {
+    #[must_use]
+    pub fn new(place: &Initialise<'_>, width: usize, hidden: usize, bias: bool) -> Self {
+        Self {
+            fc1: Linear::new(&place.at("fc1"), width, hidden, bias),
+            fc2: Linear::new(&place.at("fc2"), hidden, width, bias),
+        }
+    }
+
+    /// With GELU.
+    #[must_use]
+    pub fn forward(&self, x: Tensor<2>) -> Tensor<2> {
+        self.fc2.forward(ops::gelu(self.fc1.forward(x)))
+    }
+
+    /// With tanh.
+    #[must_use]
+    pub fn forward_tanh(&self, x: Tensor<2>) -> Tensor<2> {
+        self.fc2.forward(self.fc1.forward(x).tanh())
+    }
+}
+
+/// `fc2(silu(fc1 x) * fc3 x)`, without biases.
+#[derive(Debug, Clone)]
+pub struct SwiGlu {
+    pub fc1: Linear,
+    pub fc3: Linear,
+    pub fc2: Linear,
+}
+parameters!(SwiGlu { fc1, fc3, fc2 });
+
+impl SwiGlu {
+    #[must_use]
+    pub fn new(place: &Initialise<'_>, width: usize, hidden: usize) -> Self {
+        Self {
+            fc1: Linear::new(&place.at("fc1"), width, hidden, false),
+            fc3: Linear::new(&place.at("fc3"), width, hidden, false),
+            fc2: Linear::new(&place.at("fc2"), hidden, width, false),
+        }
+    }
+
+    #[must_use]
+    pub fn forward(&self, x: Tensor<2>) -> Tensor<2> {
+        let gate = self.fc1.forward(x.clone());
+        let value = self.fc3.forward(x);
+        self.fc2.forward(ops::swiglu(gate, value))
+    }
+}

@@ -1,0 +1,290 @@
+//! AdamW with the reference's parameter groups, and clipping by the global norm (Supp. B).
+//!
+//! Weight decay applies to everything but norms and biases. A parameter that took no part in a step has a zero gradient, not a
+//! missing one: its moments fade and its values decay.
+
+use std::collections::BTreeMap;
+
+use burn::tensor::{Tensor, TensorData};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use crate::engine::ops::{self, AdamWStep};
+use crate::engine::parameters::{Kind, to_host};
+use crate::engine::{EngineError, Gradients, HostTensor, Parameters, Values, Weights};
+
+/// How the optimizer steps.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct AdamWSettings {
+    /// Decay of the mean and of the mean square of gradients.
+    pub betas: [f64; 2],
+    /// Added to the root of the mean square.
+    pub epsilon: f64,
+    /// Share of the values lost per step and unit of learning rate; not for norms and biases.
+    pub weight_decay: f64,
+    /// Largest norm of all gradients together; larger ones are scaled down. `null`: no limit.
+    pub clip_norm: Option<f64>,
+}
+
+impl Default for AdamWSettings {
+    fn default() -> Self {
+        Self {
+            betas: [0.9, 0.95],
+            epsilon: 1e-8,
+            weight_decay: 0.05,
+            clip_norm: Some(1.0),
+        }
+    }
+}
+
+/// Whether weight decay applies to the parameter `name`.
+#[must_use]
+pub fn decays(name: &str) -> bool {
+    let is_bias = name.strip_suffix(".bias").is_some();
+    !(name.contains("norm.") || name.contains(".norm") || is_bias)
+}
+
+/// Means of gradients and of their squares, flat.
+#[derive(Debug, Clone)]
+struct Moments {
+    mean: Tensor<1>,
+    square: Tensor<1>,
+}
+
+/// The optimizer and its state.
+#[derive(Debug, Clone)]
+pub struct AdamW {
+    settings: AdamWSettings,
+    step: u64,
+    moments: BTreeMap<String, Moments>,
+}
+
+/// A step that was refused; nothing has changed.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[error("the gradient of step {step} is not finite (norm {norm})")]
+pub struct NotFinite {
+    pub step: u64,
+    pub norm: f64,
+}
+
+impl AdamW {
+    /// A fresh optimizer for the trainable parameters of `model`.
+    #[must_use]
+    pub fn new<M: Parameters + ?Sized>(settings: AdamWSettings, model: &M) -> Self {
+        let mut moments = BTreeMap::new();
+        model.visit("", &mut |name, parameter| {
+            if parameter.kind() == Kind::Trainable {
+                let zeros = parameter.untracked().zeros_like();
+                let pair = Moments {
+                    mean: zeros.clone(),
+                    square: zeros,
+                };
+                moments.insert(name.to_owned(), pair);
+            }
+        });
+        Self {
+            settings,
+            step: 0,
+            moments,
+        }
+    }
+
+    /// How many steps were taken.
+    #[must_use]
+    pub fn steps(&self) -> u64 {
+        self.step
+    }
+
+    /// Clips `gradients` by their global norm, and moves the parameters of `model`. Gives the norm before clipping.
+    ///
+    /// # Errors
+    /// When the norm is not finite. Nothing has changed then.
+    ///
+    /// # Panics
+    /// When `gradients` or `model` are not of the model the optimizer was made for.
+    pub fn step<M: Parameters + ?Sized>(
+        &mut self,
+        model: &mut M,
+        mut gradients: Gradients,
+        rate: f64,
+    ) -> Result<f64, NotFinite> {
+        let norm = gradients.norm();
+        if !norm.is_finite() {
+            return Err(NotFinite {
+                step: self.step,
+                norm,
+            });
+        }
+        self.step += 1;
+        let settings = &self.settings;
+        let scale = settings
+            .clip_norm
+            .map_or(1.0, |limit| Gradients::clip_factor(norm, limit));
+        let exponent = i32::try_from(self.step).unwrap_or(i32::MAX);
+        let mut step = AdamWStep {
+            gradient_scale: scale,
+            betas: settings.betas,
+            epsilon: settings.epsilon,
+            decay: 0.0,
+            rate: rate / (1.0 - settings.betas[0].powi(exponent)),
+            square_correction: 1.0 / (1.0 - settings.betas[1].powi(exponent)).sqrt(),
+        };
+        let moments = &mut self.moments;
+        model.visit_mut("", &mut |name, parameter| {
+            let Some(state) = moments.remove(name) else {
+                return;
+            };
+            let gradient = gradients
+                .remove(name)
+                .expect("one gradient per trainable parameter");
+            step.decay = if decays(name) {
+                rate * settings.weight_decay
+            } else {
+                0.0
+            };
+            let tracked = parameter.is_tracked();
+            let (values, mean, square) =
+                ops::adamw(parameter.take(), gradient, state.mean, state.square, step);
+            parameter.put(values, tracked);
+            moments.insert(name.to_owned(), Moments { mean, square });
+        });
+        Ok(norm)
+    }
+
+    /// The state as arrays: `step`, `exp_avg.<name>`, `exp_avg_sq.<name>`.
+    #[must_use]
+    pub fn state(&self) -> Weights {
+        let mut weights = Weights::default();
+        let step = HostTensor {
+            shape: vec![1],
+            values: Values::I64(vec![self.step as i64]),
+        };
+        weights.tensors.insert("step".to_owned(), step);
+        for (name, moments) in &self.moments {
+            for (kind, tensor) in [("exp_avg", &moments.mean), ("exp_avg_sq", &moments.square)] {
+                let values = to_host(tensor.clone());
+                let length = values.len();
+                weights.insert_f32(&format!("{kind}.{name}"), values, &[length]);
+            }
+        }
+        weights
+    }
+
+    /// Continues from a state of [`AdamW::state`]; the next steps are those the stored optimizer would have taken, to the bit.
+    ///
+    /// # Errors
+    /// When the state is of another model.
+    pub fn restore(&mut self, state: &Weights) -> Result<(), EngineError> {
+        let step = state.get("step", &[1])?.i64("step")?[0];
+        let mut restored = BTreeMap::new();
+        for (name, moments) in &self.moments {
+            let read = |kind: &str, like: &Tensor<1>| -> Result<Tensor<1>, EngineError> {
+                let name = format!("{kind}.{name}");
+                let values = state.get(&name, &like.dims())?.f32(&name)?.to_vec();
+                let length = values.len();
+                Ok(Tensor::from_data(
+                    TensorData::new(values, [length]),
+                    &like.device(),
+                ))
+            };
+            let pair = Moments {
+                mean: read("exp_avg", &moments.mean)?,
+                square: read("exp_avg_sq", &moments.square)?,
+            };
+            restored.insert(name.clone(), pair);
+        }
+        let unknown = state.tensors.len().saturating_sub(1 + 2 * restored.len());
+        if unknown > 0 {
+            return Err(EngineError::Unknown {
+                count: unknown,
+                first: state
+                    .tensors
+                    .keys()
+                    .find(|key| {
+                        !restored.contains_key(key.split_once('.').map_or("", |parts| parts.1))
+                    })
+                    .cloned()
+                    .unwrap_or_default(),
+            });
+        }
+        self.step = u64::try_from(step).unwrap_or(0);
+        self.moments = restored;
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::engine::{Compute, Initialise};
+    use crate::nn::Linear;
+
+    fn train(model: &mut Linear, optimizer: &mut AdamW, steps: std::ops::Range<u64>) {
+        for step in steps {
+            let x = Tensor::<1>::from_floats(
+                [0.5, -1.0, 0.25 * step as f32],
+                &model.weight.flat().device(),
+            );
+            let y = model.forward(x.without_autodiff().reshape([1, 3]));
+            let gradients = Gradients::of(&y.square().sum(), model);
+            optimizer.step(model, gradients, 0.01).unwrap();
+        }
+    }
+
+    #[test]
+    fn a_restored_optimizer_continues_to_the_same_bytes() {
+        let compute = Compute::cpu();
+        let mut model = Linear::new(&Initialise::new(&compute, 1), 3, 2, true);
+        model.start_training();
+        let mut optimizer = AdamW::new(AdamWSettings::default(), &model);
+        train(&mut model, &mut optimizer, 0..3);
+        let (weights, state) = (model.weights(), optimizer.state().to_bytes());
+        train(&mut model, &mut optimizer, 3..6);
+
+        let mut again = Linear::new(&Initialise::to_load(&compute), 3, 2, true);
+        again.load(&weights).unwrap();
+        again.start_training();
+        let mut resumed = AdamW::new(AdamWSettings::default(), &again);
+        resumed
+            .restore(&Weights::from_bytes(&state).unwrap())
+            .unwrap();
+        assert_eq!(resumed.steps(), 3);
+        train(&mut again, &mut resumed, 3..6);
+        assert_eq!(again.weights().to_bytes(), model.weights().to_bytes());
+        assert_eq!(resumed.state().to_bytes(), optimizer.state().to_bytes());
+    }
+
+    #[test]
+    fn a_gradient_that_is_not_finite_changes_nothing() {
+        let compute = Compute::cpu();
+        let mut model = Linear::new(&Initialise::new(&compute, 1), 1, 1, false);
+        model.start_training();
+        let before = model.weights();
+        let mut optimizer = AdamW::new(AdamWSettings::default(), &model);
+        let nan = Tensor::<1>::from_floats([f32::NAN], compute.device());
+        let gradients = Gradients::from_map([("weight".to_owned(), nan)].into());
+        assert!(optimizer.step(&mut model, gradients, 0.1).is_err());
+        assert_eq!((model.weights(), optimizer.steps()), (before, 0));
+    }
+
+    #[test]
+    fn norms_and_biases_do_not_decay() {
+        for name in [
+            "encoder.0.norm1.weight",
+            "encoder_norm.weight",
+            "a.norm_mlp.bias",
+            "x.bias",
+            "q.query_norm.weight",
+        ] {
+            assert!(!decays(name), "{name}");
+        }
+        for name in [
+            "mask_token",
+            "a.qkv.weight",
+            "encoder_embeddings.tok_rgb.mod_emb",
+        ] {
+            assert!(decays(name), "{name}");
+        }
+    }
+}
