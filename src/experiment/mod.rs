@@ -1,1 +1,29 @@
 //! The experiment language: YAML layers become a typed, checked, planned graph of stages.
+//!
+//! # Writing an op
+//! One file in `ops/`: a settings struct, a unit struct that implements [`Op`], and `inventory::submit! { OpEntry(&It) }`.
+//! The language does the rest: it parses, merges layers, resolves registry references and paths, fills defaults, checks
+//! keys, types and ranges against the schema of the settings, resolves the edges and checks their artifact kinds.
+
+pub mod artifact;
+pub mod context;
+pub mod diagnostic;
+pub mod entry;
+pub mod graph;
+pub mod merge;
+mod names;
+pub mod path;
+pub mod problem;
+pub mod source;
+pub mod stage;
+pub mod yaml;
+
+pub use artifact::{ArtifactKind, Description, SignalFacts, TokenFacts};
+pub use context::{InputArtifact, StageContext, StageError};
+pub use entry::{Entry, Kind, KindEntry, LinkedEntry};
+pub use graph::{ArtifactKey, Cell, Compare, Edge, Experiment, Graph, Interval, Layer, Stage};
+pub use path::FilePath;
+pub use problem::{Code, Problem};
+pub use stage::{
+    AnyOp, Arity, FileInput, InputFacts, Inputs, Op, OpEntry, Port, StagePlan, TokenPlan,
+};

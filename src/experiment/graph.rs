@@ -1,0 +1,281 @@
+//! The typed graph that an experiment becomes: stages with complete settings, edges, and what identifies them.
+
+use super::artifact::{ArtifactKind, Description};
+use super::diagnostic::Span;
+use super::stage::{AnyOp, FileInput, InputFacts, Inputs, StagePlan};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+use std::collections::BTreeMap;
+use std::fmt;
+use std::path::{Path, PathBuf};
+
+/// An experiment or a sweep, checked. A plain experiment has one cell.
+#[derive(Clone)]
+pub struct Experiment {
+    /// From `experiment:` or `sweep:`.
+    pub name: String,
+    pub about: String,
+    /// The file that was asked for.
+    pub path: PathBuf,
+    /// One per arm, grid point and seed, in the order of the file.
+    pub cells: Vec<Cell>,
+    /// True when the file is a sweep (even of one cell).
+    pub sweep: bool,
+    /// How the cells of a sweep are compared.
+    pub compare: Option<Compare>,
+    /// Where data sets lie: name to directory, from `data.yaml` and `REVIV_DATA_*`.
+    pub data: BTreeMap<String, PathBuf>,
+    /// Every text that took part, for byte copies in the record: files, registry entries, `--set`.
+    pub layers: Vec<Layer>,
+}
+
+/// A text that took part in an experiment.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Layer {
+    /// `experiments/ablation_tiny.yaml`, `--set stages.mget.steps=10`, `registry/masking/uniform.yaml (built in)`.
+    pub name: String,
+    pub text: String,
+}
+
+/// One arm with one seed.
+#[derive(Clone)]
+pub struct Cell {
+    /// The arm's name; empty for a plain experiment. A grid point is `arm-key=value-key=value`.
+    pub arm: String,
+    pub seed: u64,
+    pub graph: Graph,
+}
+
+impl Cell {
+    /// A name for people and file names: `full-s0`, or the experiment's own name where there is only one cell.
+    pub fn label(&self) -> String {
+        if self.arm.is_empty() {
+            format!("s{}", self.seed)
+        } else {
+            format!("{}-s{}", self.arm, self.seed)
+        }
+    }
+}
+
+/// The stages of one cell in topological order: inputs come before what reads them.
+#[derive(Clone, Default)]
+pub struct Graph {
+    pub stages: Vec<Stage>,
+}
+
+/// A stage: an op with complete settings and resolved edges.
+#[derive(Clone)]
+pub struct Stage {
+    /// The key in `stages:`; a stage of another experiment keeps its `file/stage` name.
+    pub name: String,
+    pub op: &'static dyn AnyOp,
+    /// Every setting, defaults filled in, registry references resolved, paths resolved.
+    pub settings: Value,
+    /// The seed; ops that are not seeded ignore it.
+    pub seed: u64,
+    /// One per connected port, in the order of the op's ports.
+    pub edges: Vec<Edge>,
+    /// Files outside the experiment that it reads.
+    pub files: Vec<FileInput>,
+    /// What its artifact will be.
+    pub description: Description,
+    /// Where each value was written: key path relative to the stage (`tokenizer.codebook`) to place. Values that are
+    /// defaults have none.
+    pub spans: BTreeMap<String, Span>,
+}
+
+/// What is connected to a port.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Edge {
+    pub port: &'static str,
+    /// Indices into [`Graph::stages`].
+    pub from: Vec<usize>,
+}
+
+impl Graph {
+    /// The stage of a name.
+    pub fn find(&self, name: &str) -> Option<&Stage> {
+        self.stages.iter().find(|stage| stage.name == name)
+    }
+
+    /// The descriptions that arrive at a stage.
+    pub fn inputs(&self, stage: &Stage) -> Inputs<'_> {
+        Inputs::new(
+            stage
+                .edges
+                .iter()
+                .map(|edge| {
+                    let facts = edge
+                        .from
+                        .iter()
+                        .map(|&index| {
+                            let from = &self.stages[index];
+                            InputFacts {
+                                stage: &from.name,
+                                kind: from.op.output(),
+                                description: &from.description,
+                            }
+                        })
+                        .collect();
+                    (edge.port, facts)
+                })
+                .collect(),
+        )
+    }
+
+    /// What a stage will be; no compute, no allocation.
+    pub fn plan(&self, stage: &Stage) -> StagePlan {
+        stage
+            .op
+            .plan(&stage.settings, &self.inputs(stage), stage.seed)
+    }
+
+    /// The artifact key of every stage, in order.
+    ///
+    /// A key is the blake3 hash of (op, version, settings, seed where the op is seeded, hashes of files, input keys).
+    /// Names of stages, of files and of the experiment are not part of it: the same work is done once.
+    ///
+    /// # Errors
+    /// When `hash_file` cannot read a file.
+    pub fn keys(
+        &self,
+        hash_file: &mut dyn FnMut(&Path) -> std::io::Result<blake3::Hash>,
+    ) -> std::io::Result<Vec<ArtifactKey>> {
+        let mut keys: Vec<ArtifactKey> = Vec::with_capacity(self.stages.len());
+        for stage in &self.stages {
+            let mut settings = stage.settings.clone();
+            let mut hasher = blake3::Hasher::new();
+            let mut part = |bytes: &[u8]| {
+                hasher.update(&(bytes.len() as u64).to_le_bytes());
+                hasher.update(bytes);
+            };
+            part(b"reviv artifact 1");
+            part(stage.op.name().as_bytes());
+            part(&stage.op.version().to_le_bytes());
+            if stage.op.seeded() {
+                part(&stage.seed.to_le_bytes());
+            } else {
+                part(&[]);
+            }
+            for file in &stage.files {
+                part(file.key.as_bytes());
+                part(hash_file(&file.path)?.as_bytes());
+                if let Some(value) = at_mut(&mut settings, &file.key) {
+                    *value = Value::Null;
+                }
+            }
+            part(canonical(&settings).as_bytes());
+            for edge in &stage.edges {
+                part(edge.port.as_bytes());
+                for &index in &edge.from {
+                    part(keys[index].0.as_bytes());
+                }
+            }
+            keys.push(ArtifactKey(hasher.finalize()));
+        }
+        Ok(keys)
+    }
+
+    /// The artifact kind of each stage that nothing else reads: what the experiment is for.
+    pub fn results(&self) -> Vec<(&str, ArtifactKind)> {
+        let read: Vec<usize> = self
+            .stages
+            .iter()
+            .flat_map(|stage| stage.edges.iter().flat_map(|edge| edge.from.clone()))
+            .collect();
+        self.stages
+            .iter()
+            .enumerate()
+            .filter(|(index, _)| !read.contains(index))
+            .map(|(_, stage)| (stage.name.as_str(), stage.op.output()))
+            .collect()
+    }
+}
+
+/// The content address of an artifact: `cache/ab/abcdef...`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct ArtifactKey(pub blake3::Hash);
+
+impl fmt::Display for ArtifactKey {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.0.to_hex().as_str())
+    }
+}
+
+/// How the cells of a sweep become a table: the `compare:` block.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema, Default)]
+#[serde(deny_unknown_fields, default)]
+pub struct Compare {
+    /// The arm that the others are compared with.
+    pub baseline: Option<String>,
+    /// Metric columns, in order; all where empty.
+    pub columns: Vec<String>,
+    /// Confidence intervals.
+    pub interval: Interval,
+    /// Published rows to print beside: an entry of `reviv list published`.
+    pub against: Option<String>,
+}
+
+/// Confidence intervals of a comparison.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct Interval {
+    /// The share of the distribution inside the interval.
+    #[schemars(range(min = 0.5, max = 0.9999))]
+    pub level: f64,
+    /// What is resampled, paired between arms.
+    pub over: Vec<Resample>,
+}
+
+impl Default for Interval {
+    fn default() -> Self {
+        Self {
+            level: 0.95,
+            over: vec![Resample::Seeds, Resample::Clips],
+        }
+    }
+}
+
+/// What an interval resamples.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Resample {
+    /// Training seeds.
+    Seeds,
+    /// Evaluation clips.
+    Clips,
+}
+
+/// JSON with sorted keys: the same value, the same text.
+fn canonical(value: &Value) -> String {
+    fn sorted(value: &Value) -> Value {
+        match value {
+            Value::Object(map) => {
+                let ordered: BTreeMap<&String, &Value> = map.iter().collect();
+                Value::Object(
+                    ordered
+                        .into_iter()
+                        .map(|(key, value)| (key.clone(), sorted(value)))
+                        .collect(),
+                )
+            }
+            Value::Array(items) => Value::Array(items.iter().map(sorted).collect()),
+            other => other.clone(),
+        }
+    }
+    sorted(value).to_string()
+}
+
+/// The value at a dotted key path.
+fn at_mut<'a>(value: &'a mut Value, path: &str) -> Option<&'a mut Value> {
+    let mut value = value;
+    for key in path.split('.') {
+        value = match value {
+            Value::Object(map) => map.get_mut(key)?,
+            Value::Array(items) => items.get_mut(key.parse::<usize>().ok()?)?,
+            _ => return None,
+        };
+    }
+    Some(value)
+}

@@ -1,0 +1,271 @@
+//! The [`Op`] trait: what a stage of an experiment can do. One file per op in `ops/`.
+//!
+//! An op never parses YAML. It gets its settings typed, its edges resolved and type-checked, and the descriptions of what
+//! arrives on them. It is asked three times: [`Op::check`] (no compute, reports every problem and describes its output),
+//! [`Op::plan`] (no compute, no allocation: shapes, parameters, tokens, memory, FLOP) and [`Op::run`].
+
+use super::artifact::{ArtifactKind, Description};
+use super::context::{StageContext, StageError};
+use super::problem::Problem;
+use schemars::{JsonSchema, Schema, SchemaGenerator};
+use serde::de::DeserializeOwned;
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+use std::path::PathBuf;
+
+/// How many stages a port takes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Arity {
+    /// Exactly one: `clips: clips`.
+    One,
+    /// One or none.
+    Optional,
+    /// A list of at least one: `tokenizers: [tok_body, tok_camera]`.
+    Many,
+    /// A list that may be empty or absent.
+    Any,
+}
+
+/// An input of an op: the YAML key that names the stage(s) it reads.
+#[derive(Debug, Clone, Copy)]
+pub struct Port {
+    /// The key beside the settings; must not be a settings key.
+    pub name: &'static str,
+    /// The artifact kinds it accepts.
+    pub kinds: &'static [ArtifactKind],
+    pub arity: Arity,
+    /// One line for the schema and `reviv list`.
+    pub about: &'static str,
+}
+
+/// What arrives at one edge of a port, before any compute.
+#[derive(Debug, Clone)]
+pub struct InputFacts<'a> {
+    /// The stage at the other end.
+    pub stage: &'a str,
+    pub kind: ArtifactKind,
+    pub description: &'a Description,
+}
+
+/// The descriptions of everything that arrives, by port. An op is only checked and planned when all of them are known.
+#[derive(Debug, Clone, Default)]
+pub struct Inputs<'a> {
+    ports: Vec<(&'static str, Vec<InputFacts<'a>>)>,
+}
+
+impl<'a> Inputs<'a> {
+    /// From what arrives at each port.
+    pub fn new(ports: Vec<(&'static str, Vec<InputFacts<'a>>)>) -> Self {
+        Self { ports }
+    }
+
+    /// All inputs of a port, in the order of the YAML.
+    pub fn all(&self, port: &str) -> &[InputFacts<'a>] {
+        self.ports
+            .iter()
+            .find(|(name, _)| *name == port)
+            .map_or(&[], |(_, inputs)| inputs.as_slice())
+    }
+
+    /// The description at a port of arity one or optional.
+    pub fn one(&self, port: &str) -> Option<&'a Description> {
+        self.all(port).first().map(|facts| facts.description)
+    }
+}
+
+/// A file outside the experiment that a stage reads; it must exist, and its bytes are part of the stage's identity.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct FileInput {
+    /// The settings key that names it, for the diagnostic.
+    pub key: String,
+    pub path: PathBuf,
+}
+
+/// What a stage will be, without making it. Everything is optional; what is not known stays out.
+#[derive(Debug, Clone, Default, PartialEq, Serialize)]
+pub struct StagePlan {
+    /// Named shapes: `("encoder input", [2048, 768])`.
+    pub shapes: Vec<(String, Vec<usize>)>,
+    /// Exact number of trainable parameters.
+    pub parameters: Option<u64>,
+    /// Where they are: `("trunk", 198829056)`.
+    pub parameter_parts: Vec<(String, u64)>,
+    /// Tokens per clip, and how many different ones there are.
+    pub tokens: Vec<TokenPlan>,
+    /// Steps, clips or whatever the stage counts, with its name.
+    pub work: Option<(u64, String)>,
+    /// Peak memory in bytes.
+    pub memory: Option<u64>,
+    /// Bytes the artifact will take on disk.
+    pub disk: Option<u64>,
+    /// Floating point operations of the whole stage.
+    pub flop: Option<f64>,
+    /// Seconds, where a throughput has been measured on this machine.
+    pub seconds: Option<f64>,
+    /// Anything worth a line.
+    pub lines: Vec<String>,
+}
+
+/// One modality's tokens in a plan.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct TokenPlan {
+    pub modality: String,
+    pub tokens: u64,
+    pub vocabulary: u64,
+    /// Mean number of tokens that masking shows to the encoder, by seeded simulation.
+    pub mean_input: Option<f64>,
+    /// Mean number of tokens that masking asks for, by seeded simulation.
+    pub mean_target: Option<f64>,
+}
+
+/// What a stage of an experiment does. `ops/` has one file per op, each a unit struct:
+///
+/// ```ignore
+/// pub struct Clips;
+/// impl Op for Clips { type Settings = ClipsSettings; ... }
+/// inventory::submit! { OpEntry(&Clips) }
+/// ```
+pub trait Op: Send + Sync + 'static {
+    /// The settings beside `op:` and the ports: `#[serde(deny_unknown_fields, default)]`, doc comments on every field
+    /// (they are what `reviv list` and the editor show), `#[schemars(range(min = 1))]` for bounds.
+    /// [`super::entry::Entry<T>`] is a registry reference, [`super::path::FilePath`] a file.
+    type Settings: Serialize + DeserializeOwned + JsonSchema;
+
+    /// The name after `op:`.
+    fn name(&self) -> &'static str;
+
+    /// Part of the identity of what it makes: raise it when the same settings give other bytes.
+    fn version(&self) -> u32;
+
+    /// One line for `reviv list ops`.
+    fn about(&self) -> &'static str;
+
+    /// The edges it takes.
+    fn inputs(&self) -> &'static [Port];
+
+    /// What it makes.
+    fn output(&self) -> ArtifactKind;
+
+    /// Whether what it makes depends on the seed. Ops without randomness say no and are shared between seeds.
+    fn seeded(&self) -> bool {
+        true
+    }
+
+    /// Files outside the experiment that it reads.
+    fn files(&self, _settings: &Self::Settings) -> Vec<FileInput> {
+        Vec::new()
+    }
+
+    /// Data sets (names of `data.yaml`) that it reads, with the settings key that asks for each.
+    fn data(&self, _settings: &Self::Settings) -> Vec<(String, String)> {
+        Vec::new()
+    }
+
+    /// Reports everything wrong that types and ranges do not catch, and describes the output. No compute, no files.
+    fn check(
+        &self,
+        settings: &Self::Settings,
+        inputs: &Inputs<'_>,
+        problems: &mut Vec<Problem>,
+    ) -> Description;
+
+    /// What the stage will be: called only when `check` found no error. No compute beyond a seeded simulation of
+    /// milliseconds, no allocation of a model.
+    fn plan(&self, _settings: &Self::Settings, _inputs: &Inputs<'_>, _seed: u64) -> StagePlan {
+        StagePlan::default()
+    }
+
+    /// Does it. Writes files below `context.output()` and returns the `contents` of the artifact's `manifest.json`, which
+    /// later stages find in [`super::context::InputArtifact::contents`].
+    fn run(
+        &self,
+        settings: &Self::Settings,
+        context: &mut dyn StageContext,
+    ) -> Result<Value, StageError>;
+}
+
+/// An [`Op`] with its settings type erased: what the graph holds. Implemented for every [`Op`].
+pub trait AnyOp: Send + Sync + 'static {
+    fn name(&self) -> &'static str;
+    fn version(&self) -> u32;
+    fn about(&self) -> &'static str;
+    fn inputs(&self) -> &'static [Port];
+    fn output(&self) -> ArtifactKind;
+    fn seeded(&self) -> bool;
+    /// The schema of the settings, without `op` and the ports.
+    fn schema(&self, generator: &mut SchemaGenerator) -> Schema;
+    /// Settings with every default filled in.
+    fn normalize(&self, settings: Value) -> Result<Value, serde_json::Error>;
+    fn files(&self, settings: &Value) -> Vec<FileInput>;
+    fn data(&self, settings: &Value) -> Vec<(String, String)>;
+    fn check(
+        &self,
+        settings: &Value,
+        inputs: &Inputs<'_>,
+        problems: &mut Vec<Problem>,
+    ) -> Option<Description>;
+    fn plan(&self, settings: &Value, inputs: &Inputs<'_>, seed: u64) -> StagePlan;
+    fn run(&self, settings: &Value, context: &mut dyn StageContext) -> Result<Value, StageError>;
+}
+
+fn typed<O: Op>(settings: &Value) -> Result<O::Settings, serde_json::Error> {
+    O::Settings::deserialize(settings)
+}
+
+impl<O: Op> AnyOp for O {
+    fn name(&self) -> &'static str {
+        Op::name(self)
+    }
+    fn version(&self) -> u32 {
+        Op::version(self)
+    }
+    fn about(&self) -> &'static str {
+        Op::about(self)
+    }
+    fn inputs(&self) -> &'static [Port] {
+        Op::inputs(self)
+    }
+    fn output(&self) -> ArtifactKind {
+        Op::output(self)
+    }
+    fn seeded(&self) -> bool {
+        Op::seeded(self)
+    }
+    fn schema(&self, generator: &mut SchemaGenerator) -> Schema {
+        generator.subschema_for::<O::Settings>()
+    }
+    fn normalize(&self, settings: Value) -> Result<Value, serde_json::Error> {
+        serde_json::to_value(serde_json::from_value::<O::Settings>(settings)?)
+    }
+    fn files(&self, settings: &Value) -> Vec<FileInput> {
+        typed::<O>(settings).map_or_else(|_| Vec::new(), |s| Op::files(self, &s))
+    }
+    fn data(&self, settings: &Value) -> Vec<(String, String)> {
+        typed::<O>(settings).map_or_else(|_| Vec::new(), |s| Op::data(self, &s))
+    }
+    fn check(
+        &self,
+        settings: &Value,
+        inputs: &Inputs<'_>,
+        problems: &mut Vec<Problem>,
+    ) -> Option<Description> {
+        let settings = typed::<O>(settings).ok()?;
+        Some(Op::check(self, &settings, inputs, problems))
+    }
+    fn plan(&self, settings: &Value, inputs: &Inputs<'_>, seed: u64) -> StagePlan {
+        typed::<O>(settings).map_or_else(
+            |_| StagePlan::default(),
+            |s| Op::plan(self, &s, inputs, seed),
+        )
+    }
+    fn run(&self, settings: &Value, context: &mut dyn StageContext) -> Result<Value, StageError> {
+        let settings = typed::<O>(settings).map_err(StageError::other)?;
+        Op::run(self, &settings, context)
+    }
+}
+
+/// An op that is linked in: `inventory::submit! { OpEntry(&Clips) }`. Plug-in crates do the same.
+#[derive(Clone, Copy)]
+pub struct OpEntry(pub &'static dyn AnyOp);
+
+inventory::collect!(OpEntry);
