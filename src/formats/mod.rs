@@ -1,1 +1,74 @@
-//! Container formats that carry arrays: zip, npy and npz, read with bounded memory.
+//! Container formats that carry arrays and pictures, read with bounded memory.
+//!
+//! Read in this order: [`zip`] (archives, also the shell of npz and of released checkpoints), [`npy`] (one array), [`npz`]
+//! (named arrays), [`png`] (pictures). Every reader takes untrusted bytes: a malformed file is a [`FormatError`] that says
+//! where and why, and no length field is believed before it has been compared with the size of the file.
+
+pub mod npy;
+pub mod npz;
+pub mod png;
+pub mod zip;
+
+use std::path::{Path, PathBuf};
+
+/// Why a file cannot be read or written.
+#[derive(Debug, thiserror::Error)]
+pub enum FormatError {
+    /// The bytes are not what the format prescribes, or more than this reader accepts.
+    #[error("{format}: byte {offset}: {reason}")]
+    Malformed {
+        format: &'static str,
+        /// From the start of the file (or of the uncompressed member, where the format lies inside an archive).
+        offset: u64,
+        reason: String,
+    },
+    /// The array is fine, but its values do not fit what was asked for.
+    #[error("{reason}")]
+    Conversion { reason: String },
+    /// The archive has no member of this name.
+    #[error("no `{name}` in the archive; it holds {present}")]
+    Missing { name: String, present: String },
+    #[error(transparent)]
+    Io(#[from] std::io::Error),
+    /// Any of the above, with the file it happened in.
+    #[error("{}: {source}", path.display())]
+    File {
+        path: PathBuf,
+        #[source]
+        source: Box<FormatError>,
+    },
+}
+
+impl FormatError {
+    pub(crate) fn malformed(format: &'static str, offset: u64, reason: impl Into<String>) -> Self {
+        Self::Malformed {
+            format,
+            offset,
+            reason: reason.into(),
+        }
+    }
+
+    pub(crate) fn in_file(self, path: &Path) -> Self {
+        match self {
+            Self::File { .. } => self,
+            source => Self::File {
+                path: path.to_owned(),
+                source: Box::new(source),
+            },
+        }
+    }
+}
+
+/// Writes `bytes` to a temporary name beside `path` and renames it, so that a reader never sees half a file.
+pub(crate) fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), FormatError> {
+    use std::io::Write;
+    let folder = path
+        .parent()
+        .filter(|p| !p.as_os_str().is_empty())
+        .unwrap_or(Path::new("."));
+    let mut file = tempfile::NamedTempFile::new_in(folder)?;
+    file.write_all(bytes)?;
+    file.as_file().sync_all()?;
+    file.persist(path).map_err(|e| e.error)?;
+    Ok(())
+}
