@@ -1,1 +1,3 @@
 //! Reading released weights of others without executing anything.
+
+pub mod pickle;
