@@ -2,6 +2,13 @@
 //!
 //! Video runs at 8 Hz (16 frames) or 16 Hz (32 frames), everything else at 30 Hz (60 samples). Every signal is optional and
 //! carries its validity; a missing sample is invalid, never zero. Lengths are metres, angles radians, unless a name says else.
+//!
+//! [`clock`] says which samples make a clip, [`frames`] in which frame of reference they are, [`depth_video`] how depth becomes
+//! video.
+
+pub mod clock;
+pub mod depth_video;
+pub mod frames;
 
 use nalgebra::Isometry3;
 use ndarray::{Array1, Array2, Array3, Array4, ArrayD};
@@ -23,6 +30,24 @@ pub struct Clip {
     pub body: Option<JointTrack>,
     /// Signals of modalities declared in YAML, by modality name.
     pub declared: BTreeMap<String, Signal>,
+}
+
+impl Clip {
+    /// A clip without any signal.
+    pub fn empty(id: impl Into<String>, source: impl Into<String>) -> Self {
+        Self {
+            id: id.into(),
+            source: source.into(),
+            rgb: None,
+            depth: None,
+            camera: None,
+            gaze: None,
+            left_hand: None,
+            right_hand: None,
+            body: None,
+            declared: BTreeMap::new(),
+        }
+    }
 }
 
 /// Colour video, upright, square.

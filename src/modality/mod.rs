@@ -1,6 +1,54 @@
 //! Modalities: what a signal is, and how it comes out of a [`Clip`] (Sec. 3, 4.2).
+//!
+//! [`built_in`] gives the seven of the paper at the sizes of a [`ClipFormat`]; [`declared`] makes one from a YAML entry.
+//! Read [`camera`] first, it is the most interesting conversion.
+
+pub mod camera;
+pub mod declared;
+pub mod format;
+pub mod gaze;
+pub mod joints;
+pub mod video;
+
+pub use declared::{Declared, DeclaredSettings};
+pub use format::ClipFormat;
 
 use crate::clip::{Clip, Signal};
+
+/// The names of the built-in modalities.
+pub const BUILT_IN: [&str; 7] = [
+    "rgb",
+    "depth",
+    "camera",
+    "gaze",
+    "left_hand",
+    "right_hand",
+    "body",
+];
+
+/// A built-in modality by name, at the sizes of `format`; `None` for any other name.
+pub fn built_in(name: &str, format: &ClipFormat) -> Option<Box<dyn Modality>> {
+    Some(match name {
+        "rgb" => Box::new(video::Rgb::new(format)),
+        "depth" => Box::new(video::Depth::new(format)),
+        "camera" => Box::new(camera::Camera::new(format)),
+        "gaze" => Box::new(gaze::Gaze::new(format)),
+        "left_hand" => Box::new(joints::Joints::left_hand(format)),
+        "right_hand" => Box::new(joints::Joints::right_hand(format)),
+        "body" => Box::new(joints::Joints::body(format)),
+        _ => return None,
+    })
+}
+
+/// Every modality of `format`: the built-in ones in the order of [`BUILT_IN`], then its declared ones.
+pub fn all(format: &ClipFormat) -> Vec<Box<dyn Modality>> {
+    let built_in = BUILT_IN.iter().filter_map(|name| built_in(name, format));
+    let declared = format
+        .declared
+        .iter()
+        .map(|settings| Box::new(Declared::new(settings.clone(), format)) as Box<dyn Modality>);
+    built_in.chain(declared).collect()
+}
 
 /// How a modality becomes tokens: which family of tokenizer takes it, and at which shape.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -43,6 +91,24 @@ pub trait Modality: Send + Sync {
     /// # Errors
     /// When the signal's shape is not [`Modality::shape`].
     fn insert(&self, signal: Signal, clip: &mut Clip) -> Result<(), ModalityError>;
+}
+
+/// Refuses a shape that is not the expected one.
+fn expect_shape(
+    clip: &str,
+    modality: &str,
+    found: &[usize],
+    expected: &[usize],
+) -> Result<(), ModalityError> {
+    if found == expected {
+        return Ok(());
+    }
+    Err(ModalityError::Shape {
+        clip: clip.to_owned(),
+        modality: modality.to_owned(),
+        found: found.to_vec(),
+        expected: expected.to_vec(),
+    })
 }
 
 /// Why a clip and a modality do not fit.

@@ -1,0 +1,151 @@
+//! Rigid (SE(3)) and similarity (Sim(3)) transforms: aliases of nalgebra's types and what they lack.
+
+use super::rotation;
+use nalgebra::{
+    Isometry3, Matrix3, Matrix4, Point3, Similarity3, Translation3, UnitQuaternion, Vector3,
+};
+
+/// A rigid transform, `T_to_from`.
+pub type Rigid = Isometry3<f64>;
+/// A rotation, translation and scale: `x' = s R x + t`.
+pub type Sim3 = Similarity3<f64>;
+
+/// How far a matrix may be from a rotation (largest entry of `RᵀR - 1`) to be read as one.
+const ROTATION_TOLERANCE: f64 = 1e-3;
+
+/// Why sixteen numbers are not a pose.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub enum PoseError {
+    #[error("the pose has a value that is not finite")]
+    NotFinite,
+    #[error("the pose's last row is not 0 0 0 1")]
+    NotAffine,
+    #[error("the pose's rotation part is not a rotation")]
+    NotARotation,
+}
+
+/// A pose from a 4x4 matrix in row-major order.
+///
+/// # Errors
+/// When a value is not finite, the last row is not `0 0 0 1`, or the rotation part is mirrored, scaled or sheared by more
+/// than 1e-3.
+pub fn from_row_major(m: &[f64; 16]) -> Result<Rigid, PoseError> {
+    if !m.iter().all(|v| v.is_finite()) {
+        return Err(PoseError::NotFinite);
+    }
+    let m = Matrix4::from_row_slice(m);
+    let last = m.row(3);
+    if last
+        .iter()
+        .zip([0.0, 0.0, 0.0, 1.0])
+        .any(|(a, b)| (a - b).abs() > 1e-6)
+    {
+        return Err(PoseError::NotAffine);
+    }
+    let r: Matrix3<f64> = m.fixed_view::<3, 3>(0, 0).into_owned();
+    let off = (r.transpose() * r - Matrix3::identity()).amax();
+    if off > ROTATION_TOLERANCE || r.determinant() < 0.0 {
+        return Err(PoseError::NotARotation);
+    }
+    let rotation = rotation::nearest(&r).ok_or(PoseError::NotARotation)?;
+    Ok(Rigid::from_parts(
+        Translation3::new(m[(0, 3)], m[(1, 3)], m[(2, 3)]),
+        rotation,
+    ))
+}
+
+/// The 4x4 matrix of a pose in row-major order.
+pub fn to_row_major(pose: &Rigid) -> [f64; 16] {
+    let m = pose.to_homogeneous().transpose();
+    let mut out = [0.0; 16];
+    out.copy_from_slice(m.as_slice());
+    out
+}
+
+/// `T_a_b` from `T_world_a` and `T_world_b`.
+pub fn relative(T_world_a: &Rigid, T_world_b: &Rigid) -> Rigid {
+    T_world_a.inv_mul(T_world_b)
+}
+
+/// Between two poses: linear in position, spherical in rotation.
+pub fn interpolate(a: &Rigid, b: &Rigid, t: f64) -> Rigid {
+    let position = a.translation.vector.lerp(&b.translation.vector, t);
+    Rigid::from_parts(
+        position.into(),
+        rotation::slerp(&a.rotation, &b.rotation, t),
+    )
+}
+
+/// A similarity from its parts; `None` unless `scale` is finite and positive.
+pub fn similarity(
+    scale: f64,
+    rotation: UnitQuaternion<f64>,
+    translation: Vector3<f64>,
+) -> Option<Sim3> {
+    (scale.is_finite() && scale > 0.0)
+        .then(|| Sim3::from_parts(translation.into(), rotation, scale))
+}
+
+/// A pose moved by a similarity: the position is scaled, the rotation only turned.
+pub fn apply_to_pose(sim: &Sim3, pose: &Rigid) -> Rigid {
+    let position = sim * Point3::from(pose.translation.vector);
+    Rigid::from_parts(
+        position.coords.into(),
+        sim.isometry.rotation * pose.rotation,
+    )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn pose() -> Rigid {
+        Rigid::new(Vector3::new(1.0, -2.0, 0.5), Vector3::new(0.3, -1.1, 0.7))
+    }
+
+    #[test]
+    fn matrices_round_trip() {
+        let back = from_row_major(&to_row_major(&pose())).unwrap();
+        assert!((back.to_homogeneous() - pose().to_homogeneous()).amax() < 1e-12);
+        assert_eq!(to_row_major(&pose())[3], 1.0);
+    }
+
+    #[test]
+    fn what_is_no_pose_is_refused() {
+        let good = to_row_major(&pose());
+        let mut bad = good;
+        bad[5] = f64::NAN;
+        assert_eq!(from_row_major(&bad), Err(PoseError::NotFinite));
+        bad = good;
+        bad[12] = 0.1;
+        assert_eq!(from_row_major(&bad), Err(PoseError::NotAffine));
+        bad = good;
+        bad[0] += 0.1;
+        assert_eq!(from_row_major(&bad), Err(PoseError::NotARotation));
+        bad = good;
+        for v in &mut bad[0..3] {
+            *v = -*v;
+        }
+        assert_eq!(from_row_major(&bad), Err(PoseError::NotARotation));
+    }
+
+    #[test]
+    fn relative_poses_compose_back() {
+        let (a, b) = (pose(), Rigid::translation(1.0, 2.0, 3.0) * pose().inverse());
+        let back = a * relative(&a, &b);
+        assert!((back.to_homogeneous() - b.to_homogeneous()).amax() < 1e-12);
+        let half = interpolate(&a, &b, 0.5);
+        let mid = (a.translation.vector + b.translation.vector) / 2.0;
+        assert!((half.translation.vector - mid).norm() < 1e-12);
+    }
+
+    #[test]
+    fn a_similarity_scales_positions_and_turns_poses() {
+        let sim = similarity(2.0, pose().rotation, Vector3::new(0.0, 0.0, 1.0)).unwrap();
+        let moved = apply_to_pose(&sim, &pose());
+        let expected = 2.0 * (pose().rotation * pose().translation.vector) + Vector3::z();
+        assert!((moved.translation.vector - expected).norm() < 1e-12);
+        assert!(similarity(0.0, pose().rotation, Vector3::zeros()).is_none());
+        assert!(similarity(f64::NAN, pose().rotation, Vector3::zeros()).is_none());
+    }
+}
