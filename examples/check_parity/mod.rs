@@ -1,0 +1,49 @@
+//! One file per folder of vectors; [`report`] and [`vectors`] are what they share.
+
+pub mod report;
+pub mod vectors;
+
+mod optim;
+
+use std::path::Path;
+
+use report::Report;
+
+/// An error of the check itself: a file that cannot be read, a model that cannot be built.
+pub type Outcome<T = ()> = Result<T, Box<dyn std::error::Error>>;
+
+/// Compares one folder.
+type Check = fn(&Path, &mut Report) -> Outcome;
+
+/// The folders that are known, and what compares each.
+const FOLDERS: &[(&str, Check)] = &[("optim", optim::check)];
+
+/// Compares everything below `folder`: one known folder, or a set of them.
+pub fn check(folder: &Path) -> Outcome<Report> {
+    let folder = &folder
+        .canonicalize()
+        .map_err(|error| format!("{}: {error}", folder.display()))?;
+    let mut report = Report::default();
+    let own = folder.file_name().and_then(|name| name.to_str());
+    if let Some((_, check)) = FOLDERS.iter().find(|(name, _)| Some(*name) == own) {
+        check(folder, &mut report)?;
+        return Ok(report);
+    }
+    let present: Vec<_> = FOLDERS
+        .iter()
+        .filter(|(name, _)| folder.join(name).is_dir())
+        .collect();
+    if present.is_empty() {
+        let known: Vec<&str> = FOLDERS.iter().map(|(name, _)| *name).collect();
+        return Err(format!(
+            "{} is none of, and holds none of: {}",
+            folder.display(),
+            known.join(" ")
+        )
+        .into());
+    }
+    for (name, check) in present {
+        check(&folder.join(name), &mut report)?;
+    }
+    Ok(report)
+}

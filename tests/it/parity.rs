@@ -1,0 +1,13 @@
+//! The numbers of the reference implementation, as far as the vectors are at hand.
+
+#[path = "../../examples/check_parity/mod.rs"]
+mod check_parity;
+
+#[test]
+fn every_tensor_of_the_parity_vectors_matches() {
+    let Some(shared) = crate::shared::folder() else {
+        return;
+    };
+    let report = check_parity::check(&shared.join("vectors/parity")).unwrap();
+    assert!(report.passed(), "{report}");
+}
