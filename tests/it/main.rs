@@ -1,1 +1,4 @@
 //! One integration test binary, a file per command or promise.
+
+mod parity;
+mod shared;
