@@ -1,0 +1,77 @@
+//! How much of a codebook a tokenizer uses, over a whole split (Supp. A).
+
+use super::outcome::Refusal;
+
+/// Use of a codebook of `size` codes.
+#[derive(Debug, Clone, PartialEq, Default, serde::Serialize)]
+pub struct CodebookUse {
+    pub size: usize,
+    /// Usage is bounded by `n_tokens / size`: print it beside.
+    pub n_tokens: usize,
+    pub distinct: usize,
+    /// Distinct codes over the size; `None` without tokens.
+    pub usage: Option<f64>,
+    /// `exp(-Σ p ln p)`; `None` without tokens.
+    pub perplexity: Option<f64>,
+}
+
+/// Counts codes over a whole split; feed it every clip, then ask.
+#[derive(Debug, Clone)]
+pub struct CodeCounts {
+    counts: Vec<u64>,
+}
+
+impl CodeCounts {
+    #[must_use]
+    pub fn new(size: usize) -> Self {
+        Self {
+            counts: vec![0; size],
+        }
+    }
+
+    /// # Errors
+    /// When a code is negative or not below the size.
+    pub fn add(&mut self, code: i64) -> Result<(), Refusal> {
+        let size = self.counts.len();
+        let slot = usize::try_from(code)
+            .ok()
+            .and_then(|c| self.counts.get_mut(c));
+        *slot.ok_or(Refusal::CodeOutside { code, size })? += 1;
+        Ok(())
+    }
+
+    #[must_use]
+    pub fn summary(&self) -> CodebookUse {
+        let total: u64 = self.counts.iter().sum();
+        let distinct = self.counts.iter().filter(|&&c| c > 0).count();
+        let entropy: f64 = self
+            .counts
+            .iter()
+            .filter(|&&c| c > 0)
+            .map(|&c| c as f64 / total as f64)
+            .map(|p| -p * p.ln())
+            .sum();
+        CodebookUse {
+            size: self.counts.len(),
+            n_tokens: total as usize,
+            distinct,
+            usage: (total > 0).then(|| distinct as f64 / self.counts.len() as f64),
+            perplexity: (total > 0).then(|| entropy.exp()),
+        }
+    }
+}
+
+/// [`CodebookUse`] of one list of codes.
+///
+/// # Errors
+/// As [`CodeCounts::add`].
+pub fn codebook_use(
+    codes: impl IntoIterator<Item = i64>,
+    size: usize,
+) -> Result<CodebookUse, Refusal> {
+    let mut counts = CodeCounts::new(size);
+    for code in codes {
+        counts.add(code)?;
+    }
+    Ok(counts.summary())
+}

@@ -1,0 +1,37 @@
+//! The metric numbers of `evo` on real trajectories (TUM RGB-D, freiburg1_xyz).
+
+use reviv::evaluation::tum::{MAX_DIFFERENCE, compare, read_tum};
+use reviv::geometry::alignment::Freedom;
+
+/// `evo` 1.38 wrote the reference; equal to nine digits.
+#[test]
+fn trajectory_errors_equal_those_of_evo() {
+    let Some(shared) = crate::shared::folder() else {
+        return;
+    };
+    let data = shared.join("data");
+    let text = std::fs::read_to_string(data.join("refs/freiburg1_xyz-rgbdslam.evo.json")).unwrap();
+    let evo: serde_json::Value = serde_json::from_str(&text).unwrap();
+    let reference = read_tum(&data.join("trajectories/freiburg1_xyz-groundtruth.txt")).unwrap();
+    let estimate = read_tum(&data.join("trajectories/freiburg1_xyz-rgbdslam.txt")).unwrap();
+    for (freedom, suffix) in [(Freedom::Rigid, "se3"), (Freedom::Similarity, "sim3")] {
+        let errors = compare(&reference, &estimate, MAX_DIFFERENCE, freedom).unwrap();
+        assert_eq!(errors.n_poses as u64, evo["pairs"].as_u64().unwrap());
+        for (name, ours) in [
+            ("ate_rmse_m", errors.ate_rmse),
+            ("rpe_trans_m_rmse", errors.rte_rmse),
+            ("rpe_rot_deg_rmse", errors.rre_rmse),
+        ] {
+            let theirs = evo[format!("{name}_{suffix}")].as_f64().unwrap();
+            let ours = ours.unwrap();
+            assert!(
+                (ours - theirs).abs() < 1e-9 * theirs,
+                "{name}_{suffix}: {ours} against {theirs}"
+            );
+        }
+        if freedom == Freedom::Similarity {
+            let theirs = evo["sim3_scale"].as_f64().unwrap();
+            assert!((errors.alignment.unwrap().scale - theirs).abs() < 1e-9);
+        }
+    }
+}
