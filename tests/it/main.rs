@@ -1,5 +1,6 @@
 //! One integration test binary, a file per command or promise.
 
+mod metrics;
 mod parity;
 mod shared;
 mod trajectories;
