@@ -1,0 +1,143 @@
+//! What can go wrong while a run is executed and recorded, each with a code, a sentence and a way out.
+
+use std::io;
+use std::path::{Path, PathBuf};
+
+/// Who has a lock, as its file says.
+#[derive(Debug, Clone, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+pub struct Holder {
+    pub host: String,
+    pub pid: u32,
+    /// UTC, ISO 8601.
+    pub since: String,
+}
+
+/// A failure of the record: the run directory, the cache, the locks, a stage.
+#[derive(Debug, thiserror::Error)]
+pub enum RunError {
+    /// The device of `path` is full, or a quota is used up.
+    #[error("no space left while {action} `{path}`")]
+    NoSpace { action: &'static str, path: PathBuf },
+    /// `path` cannot be written.
+    #[error("`{path}` cannot be written: {reason}")]
+    ReadOnly { path: PathBuf, reason: io::Error },
+    /// Any other failure of the file system.
+    #[error("{action} `{path}` failed: {reason}")]
+    Io {
+        action: &'static str,
+        path: PathBuf,
+        reason: io::Error,
+    },
+    /// A live process owns what is asked for.
+    #[error("`{path}` is in use by another process{}", holder_text(.holder.as_ref()))]
+    Held {
+        path: PathBuf,
+        holder: Option<Holder>,
+    },
+    /// A file of the record does not say what it must.
+    #[error("`{path}` is not what this version writes: {reason}")]
+    Malformed { path: PathBuf, reason: String },
+    /// What was hashed once has other bytes now.
+    #[error("{what} has changed: {detail}")]
+    Changed { what: String, detail: String },
+    /// Somebody asked to stop, and the stage did.
+    #[error("interrupted")]
+    Interrupted,
+    /// The request names something that is not there, or makes no sense.
+    #[error("{message}")]
+    Request { message: String, help: String },
+}
+
+fn holder_text(holder: Option<&Holder>) -> String {
+    holder.map_or_else(String::new, |h| {
+        format!(": pid {} on `{}`, since {}", h.pid, h.host, h.since)
+    })
+}
+
+impl RunError {
+    /// Sorts an I/O error into the cases that a user mends differently.
+    pub fn io(action: &'static str, path: &Path, reason: io::Error) -> Self {
+        let path = path.to_path_buf();
+        match reason.kind() {
+            io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => {
+                Self::NoSpace { action, path }
+            }
+            io::ErrorKind::ReadOnlyFilesystem | io::ErrorKind::PermissionDenied => {
+                Self::ReadOnly { path, reason }
+            }
+            _ => Self::Io {
+                action,
+                path,
+                reason,
+            },
+        }
+    }
+
+    /// The code printed in brackets. `E05` budgets, `E06` inputs missing or changed, `E08` the record.
+    pub fn code(&self) -> &'static str {
+        match self {
+            Self::NoSpace { .. } => "E0502",
+            Self::Changed { .. } => "E0602",
+            Self::Held { .. } => "E0801",
+            Self::ReadOnly { .. } => "E0802",
+            Self::Io { .. } => "E0803",
+            Self::Malformed { .. } => "E0804",
+            Self::Interrupted => "E0805",
+            Self::Request { .. } => "E0807",
+        }
+    }
+
+    /// What the user can do about it.
+    pub fn help(&self) -> String {
+        match self {
+            Self::NoSpace { .. } => {
+                "free some space (`reviv gc` prunes the cache), then ask for the same experiment \
+                                     again: what was finished stays and it continues"
+                    .into()
+            }
+            Self::Changed { .. } => {
+                "the stages that read it have to run again: ask for the experiment again".into()
+            }
+            Self::Held { .. } => {
+                "wait for that process or stop it; to work side by side, give each process its own \
+                                  `--shard i/n`"
+                    .into()
+            }
+            Self::ReadOnly { .. } => {
+                "make it writable, or choose another place with `--runs DIR`".into()
+            }
+            Self::Io { .. } => {
+                "the file system refused; the run continues when it is asked for again".into()
+            }
+            Self::Malformed { .. } => {
+                "move the file away, or delete the run directory that holds it".into()
+            }
+            Self::Interrupted => "ask for the same experiment again and it continues".into(),
+            Self::Request { help, .. } => help.clone(),
+        }
+    }
+
+    /// 1 for what the user asked or gave, 2 for the machine, 130 for an interrupt (as shells have it).
+    pub fn exit_code(&self) -> u8 {
+        match self {
+            Self::Held { .. }
+            | Self::ReadOnly { .. }
+            | Self::Changed { .. }
+            | Self::Malformed { .. }
+            | Self::Request { .. } => 1,
+            Self::NoSpace { .. } | Self::Io { .. } => 2,
+            Self::Interrupted => 130,
+        }
+    }
+}
+
+/// Adds what was done to which file to an I/O error.
+pub trait AtPath<T> {
+    fn at(self, action: &'static str, path: &Path) -> Result<T, RunError>;
+}
+
+impl<T> AtPath<T> for io::Result<T> {
+    fn at(self, action: &'static str, path: &Path) -> Result<T, RunError> {
+        self.map_err(|reason| RunError::io(action, path, reason))
+    }
+}
