@@ -26,7 +26,8 @@ pub trait StageContext {
     /// Where the artifact is written. The directory becomes visible under its key only when the stage has succeeded.
     fn output(&self) -> &Path;
 
-    /// A directory that survives interruption, empty the first time. Gone once the stage has succeeded.
+    /// A directory that survives interruption, empty the first time. [`crate::run::checkpoint`] keeps whole checkpoints in
+    /// it. What is left in it when the stage succeeds is kept for `reviv verify`.
     fn checkpoints(&self) -> &Path;
 
     /// The seed of the stage: the first argument of every [`crate::random::stream`].
@@ -51,6 +52,12 @@ pub trait StageContext {
 
     /// One line for the stage's `log.txt` (and the terminal, where it is asked for).
     fn log(&mut self, line: &str);
+
+    /// Brings everything recorded to the disk. Call it before a checkpoint becomes visible, so that a resumed stage finds
+    /// what was recorded before it; [`crate::run::checkpoint::save`] does.
+    fn flush(&mut self) -> Result<(), StageError> {
+        Ok(())
+    }
 
     /// True after Ctrl-C or a termination signal. Poll it; when true, write a checkpoint and return
     /// [`StageError::Interrupted`].

@@ -1,6 +1,6 @@
 //! The content-addressed cache of artifacts.
 //!
-//! An artifact's [`Key`] is the blake3 hash of the op, the op's version, the resolved
+//! An artifact's [`Key`] ([`crate::experiment::Graph::keys`]) is the blake3 hash of the op, the op's version, the resolved
 //! settings, the seed, the bytes of the files it reads and the keys of the input artifacts: everything that decides its bytes. The directory
 //! `cache/ab/abcdef.../` is the artifact; it appears in one step, complete, with a [`Manifest`] that lists its files. What
 //! has no manifest, or lost a file, is not there.
@@ -10,6 +10,7 @@ use super::error::{AtPath, RunError};
 use super::files;
 use super::interrupt::Interrupt;
 use super::lock::{self, Lock};
+use crate::experiment::ArtifactKey;
 
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
@@ -49,6 +50,12 @@ impl Key {
 impl From<blake3::Hash> for Key {
     fn from(hash: blake3::Hash) -> Self {
         Self(*hash.as_bytes())
+    }
+}
+
+impl From<ArtifactKey> for Key {
+    fn from(key: ArtifactKey) -> Self {
+        key.0.into()
     }
 }
 

@@ -42,7 +42,9 @@ pub fn all(checkpoints: &Path) -> Vec<(u64, PathBuf)> {
     let mut found = Vec::new();
     for entry in entries.flatten() {
         let name = entry.file_name();
-        let step = name.to_str().and_then(|name| name.strip_prefix("step-")?.parse().ok());
+        let step = name
+            .to_str()
+            .and_then(|name| name.strip_prefix("step-")?.parse().ok());
         if let Some(step) = step {
             found.push((step, entry.path()));
         }

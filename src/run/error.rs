@@ -131,6 +131,15 @@ impl RunError {
     }
 }
 
+impl From<RunError> for crate::experiment::StageError {
+    fn from(error: RunError) -> Self {
+        match error {
+            RunError::Interrupted => Self::Interrupted,
+            error => Self::Other(Box::new(error)),
+        }
+    }
+}
+
 /// Adds what was done to which file to an I/O error.
 pub trait AtPath<T> {
     fn at(self, action: &'static str, path: &Path) -> Result<T, RunError>;
