@@ -1,8 +1,9 @@
 //! The typed graph that an experiment becomes: stages with complete settings, edges, and what identifies them.
 
 use super::artifact::{ArtifactKind, Description};
-use super::diagnostic::Span;
+use super::source::Sources;
 use super::stage::{AnyOp, FileInput, InputFacts, Inputs, StagePlan};
+use super::typed::Trace;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
@@ -27,15 +28,7 @@ pub struct Experiment {
     /// Where data sets lie: name to directory, from `data.yaml` and `REVIV_DATA_*`.
     pub data: BTreeMap<String, PathBuf>,
     /// Every text that took part, for byte copies in the record: files, registry entries, `--set`.
-    pub layers: Vec<Layer>,
-}
-
-/// A text that took part in an experiment.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
-pub struct Layer {
-    /// `experiments/ablation_tiny.yaml`, `--set stages.mget.steps=10`, `registry/masking/uniform.yaml (built in)`.
-    pub name: String,
-    pub text: String,
+    pub sources: Sources,
 }
 
 /// One arm with one seed.
@@ -80,9 +73,9 @@ pub struct Stage {
     pub files: Vec<FileInput>,
     /// What its artifact will be.
     pub description: Description,
-    /// Where each value was written: key path relative to the stage (`tokenizer.codebook`) to place. Values that are
-    /// defaults have none.
-    pub spans: BTreeMap<String, Span>,
+    /// Where each value was written, and what it replaced: key path relative to the stage (`tokenizer.codebook`) to
+    /// place. Values that are defaults have none.
+    pub traces: BTreeMap<String, Trace>,
 }
 
 /// What is connected to a port.

@@ -6,22 +6,31 @@
 //! keys, types and ranges against the schema of the settings, resolves the edges and checks their artifact kinds.
 
 pub mod artifact;
+pub mod catalog;
+mod compose;
 pub mod context;
+pub mod data;
 pub mod diagnostic;
 pub mod entry;
 pub mod graph;
+mod interpolate;
+pub mod load;
 pub mod merge;
 mod names;
 pub mod path;
 pub mod problem;
+pub mod registry;
+mod resolve;
 pub mod source;
 pub mod stage;
+mod sweep;
+pub mod typed;
 pub mod yaml;
 
 pub use artifact::{ArtifactKind, Description, SignalFacts, TokenFacts};
 pub use context::{InputArtifact, StageContext, StageError};
 pub use entry::{Entry, Kind, KindEntry, LinkedEntry};
-pub use graph::{ArtifactKey, Cell, Compare, Edge, Experiment, Graph, Interval, Layer, Stage};
+pub use graph::{ArtifactKey, Cell, Compare, Edge, Experiment, Graph, Interval, Stage};
 pub use path::FilePath;
 pub use problem::{Code, Problem};
 pub use stage::{

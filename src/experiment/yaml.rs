@@ -235,8 +235,17 @@ pub fn parse(text: &str, layer: u32, diagnostics: &mut Vec<Diagnostic>) -> Optio
     parse_from(text, 0, layer, diagnostics)
 }
 
-/// Parses what follows the first `offset` bytes of a text.
-pub fn parse_from(
+/// Parses the value that follows the first `offset` bytes of a text; it may be nothing.
+pub fn parse_value(
+    text: &str,
+    offset: usize,
+    layer: u32,
+    diagnostics: &mut Vec<Diagnostic>,
+) -> Option<Node> {
+    parse_from(text, offset, layer, diagnostics)
+}
+
+fn parse_from(
     text: &str,
     offset: usize,
     layer: u32,
@@ -308,7 +317,7 @@ impl<'t> Builder<'t, '_> {
             }
         }
         let empty = root.as_ref().is_none_or(|node| node.data == Data::Null);
-        if empty {
+        if empty && self.offset < 4 {
             return Err(Box::new(
                 Diagnostic::new(Code::E0101, Span::point(self.layer, 0), "the file is empty")
                     .help("an experiment starts with `experiment: NAME` and has `stages:`"),

@@ -4,3 +4,6 @@ mod metrics;
 mod parity;
 mod shared;
 mod trajectories;
+
+mod language;
+mod language_ops;

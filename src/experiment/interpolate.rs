@@ -1,0 +1,195 @@
+//! `${params.x}` and `${env.X}`: the only two substitutions of the language. `$${` writes a plain `${`.
+
+use super::diagnostic::Diagnostic;
+use super::names;
+use super::problem::Code;
+use super::yaml::{self, Data, Node};
+use std::collections::BTreeMap;
+
+/// Longest text that substitution may make.
+const MAX_TEXT: usize = 1 << 16;
+/// Values that substitution may make in one document.
+const MAX_WEIGHT: usize = yaml::MAX_WEIGHT;
+
+/// The variables of the environment.
+pub type Environment<'a> = &'a BTreeMap<String, String>;
+
+/// Substitutes everywhere below `node`, with `params` of the same document.
+pub fn interpolate(
+    node: Node,
+    params: &Node,
+    environment: Environment<'_>,
+    diagnostics: &mut Vec<Diagnostic>,
+) -> Node {
+    let mut pass = Pass {
+        params,
+        environment,
+        diagnostics,
+        weight: 0,
+    };
+    pass.node(node, 0)
+}
+
+struct Pass<'a> {
+    params: &'a Node,
+    environment: Environment<'a>,
+    diagnostics: &'a mut Vec<Diagnostic>,
+    weight: usize,
+}
+
+impl Pass<'_> {
+    fn node(&mut self, mut node: Node, depth: usize) -> Node {
+        node.data = match node.data {
+            Data::List(nodes) => {
+                Data::List(nodes.into_iter().map(|n| self.node(n, depth)).collect())
+            }
+            Data::Map(items) => Data::Map(
+                items
+                    .into_iter()
+                    .map(|mut item| {
+                        item.value = self.node(item.value, depth);
+                        item
+                    })
+                    .collect(),
+            ),
+            Data::Text(text) if text.contains("${") => {
+                return self.text(&text, Node::new(Data::Null, node.span), node.before, depth);
+            }
+            other => other,
+        };
+        node
+    }
+
+    fn text(&mut self, text: &str, place: Node, before: Option<Box<Node>>, depth: usize) -> Node {
+        let fail = |mut place: Node| {
+            place.data = Data::Text("???".to_owned());
+            place
+        };
+        if depth > 16 {
+            self.report(
+                &place,
+                "`${params...}` refer to each other in a circle",
+                "break the circle",
+            );
+            return fail(place);
+        }
+        // A whole value keeps its type.
+        if let Some(name) = text
+            .strip_prefix("${")
+            .and_then(|rest| rest.strip_suffix('}'))
+            && !name.contains('}')
+        {
+            let mut node = match self.look_up(name, &place) {
+                Some(node) => self.node(node, depth + 1),
+                None => fail(place.clone()),
+            };
+            self.weight += node.weight();
+            if self.weight > MAX_WEIGHT {
+                self.report(
+                    &place,
+                    "substitution makes too many values",
+                    "check `params`",
+                );
+                return fail(place);
+            }
+            let source = Node::new(node.data.clone(), node.span);
+            node.before = if node.span == place.span {
+                before
+            } else {
+                Some(Box::new(Node { before, ..source }))
+            };
+            node.span = place.span;
+            return node;
+        }
+        let mut out = String::new();
+        let mut rest = text;
+        while let Some(at) = rest.find("${") {
+            if rest[..at].ends_with('$') {
+                out.push_str(&rest[..at - 1]);
+                out.push_str("${");
+                rest = &rest[at + 2..];
+                continue;
+            }
+            out.push_str(&rest[..at]);
+            let Some(end) = rest[at..].find('}') else {
+                self.report(
+                    &place,
+                    "`${` without `}`",
+                    "write `$${` for the characters `${`",
+                );
+                return fail(place);
+            };
+            let name = &rest[at + 2..at + end];
+            let Some(node) = self.look_up(name, &place) else {
+                return fail(place);
+            };
+            let node = self.node(node, depth + 1);
+            if matches!(node.data, Data::List(_) | Data::Map(_) | Data::Null) {
+                let message = format!(
+                    "`${{{name}}}` is {} and cannot be part of a text",
+                    node.what()
+                );
+                self.report(&place, &message, "");
+                return fail(place);
+            }
+            out.push_str(&node.inline());
+            rest = &rest[at + end + 1..];
+            if out.len() > MAX_TEXT {
+                self.report(
+                    &place,
+                    "substitution makes a text of more than 64 kB",
+                    "check `params`",
+                );
+                return fail(place);
+            }
+        }
+        out.push_str(rest);
+        let mut node = place;
+        node.data = Data::Text(out);
+        node.before = before;
+        node
+    }
+
+    fn look_up(&mut self, name: &str, place: &Node) -> Option<Node> {
+        if let Some(key) = name.strip_prefix("params.") {
+            if let Some(node) = self.params.at(key) {
+                return Some(node.clone());
+            }
+            let known: Vec<&str> = self
+                .params
+                .items()
+                .iter()
+                .map(|item| item.key.as_str())
+                .collect();
+            let help = if known.is_empty() {
+                format!("add `params: {{{key}: ...}}`")
+            } else {
+                names::suggest(key, &known).unwrap_or_default()
+            };
+            self.report(place, &format!("unknown parameter `{key}`"), &help);
+            return None;
+        }
+        if let Some(variable) = name.strip_prefix("env.") {
+            if let Some(value) = self.environment.get(variable) {
+                return Some(Node::new(yaml::plain(value), place.span));
+            }
+            self.report(
+                place,
+                &format!("the environment has no `{variable}`"),
+                &format!("run with `{variable}=...` before the command"),
+            );
+            return None;
+        }
+        self.report(
+            place,
+            &format!("`${{{name}}}` is neither `${{params.x}}` nor `${{env.X}}`"),
+            "the language has these two substitutions and no expressions; write `$${` for the characters `${`",
+        );
+        None
+    }
+
+    fn report(&mut self, place: &Node, message: &str, help: &str) {
+        self.diagnostics
+            .push(Diagnostic::new(Code::E0105, place.span, message).help(help));
+    }
+}

@@ -1,0 +1,231 @@
+//! From a path to an [`Experiment`]: reads the layers, composes them, opens a sweep into its cells and resolves each.
+
+use super::catalog::Catalog;
+use super::compose::Composer;
+use super::data;
+use super::diagnostic::{Diagnostic, Report, Span};
+use super::graph::{Cell, Experiment};
+use super::problem::Code;
+use super::registry::Registry;
+use super::resolve::Resolver;
+use super::source::Sources;
+use super::sweep;
+use super::yaml::{self, Node};
+use std::collections::BTreeMap;
+use std::io::Read as _;
+use std::path::{Path, PathBuf};
+
+/// What to load, and what to change in it.
+#[derive(Debug, Clone, Default)]
+pub struct Request {
+    /// The experiment or sweep.
+    pub path: PathBuf,
+    /// `--set` arguments: `stages.mget.steps=10`.
+    pub set: Vec<String>,
+    /// `--seed`: the seed of an experiment; for a sweep, the only one.
+    pub seed: Option<u64>,
+}
+
+/// Loads an experiment and checks everything that can be checked without compute.
+///
+/// The experiment is there when the report has no errors.
+pub fn load(catalog: &Catalog, request: &Request) -> (Option<Experiment>, Report) {
+    load_in(
+        catalog,
+        request,
+        &std::env::vars_os()
+            .filter_map(|(name, value)| Some((name.into_string().ok()?, value.into_string().ok()?)))
+            .collect(),
+    )
+}
+
+/// [`load`] with another environment.
+pub fn load_in(
+    catalog: &Catalog,
+    request: &Request,
+    environment: &BTreeMap<String, String>,
+) -> (Option<Experiment>, Report) {
+    let mut sources = Sources::default();
+    let mut diagnostics = Vec::new();
+    let experiment = build(
+        catalog,
+        request,
+        environment,
+        &mut sources,
+        &mut diagnostics,
+    );
+    let mut report = Report {
+        diagnostics,
+        sources,
+    };
+    report.tidy();
+    let experiment = experiment
+        .filter(|_| !report.failed())
+        .map(|mut experiment| {
+            experiment.sources = report.sources.clone();
+            experiment
+        });
+    (experiment, report)
+}
+
+fn build(
+    catalog: &Catalog,
+    request: &Request,
+    environment: &BTreeMap<String, String>,
+    sources: &mut Sources,
+    diagnostics: &mut Vec<Diagnostic>,
+) -> Option<Experiment> {
+    let mut composer = Composer::new(catalog, sources, diagnostics);
+    let root = composer.file(&request.path)?;
+    let mut patches = composer.overrides(&request.set);
+    if let Some(seed) = request.seed {
+        patches.extend(composer.overrides(&[format!("seed={seed}")]));
+    }
+    let is_sweep = root.get("sweep").is_some();
+    let plan = if is_sweep {
+        sweep::open(&mut composer, root, patches)?
+    } else {
+        sweep::single(&mut composer, root, patches)
+    };
+    if diagnostics.iter().any(|d| !d.code.is_warning()) {
+        return None;
+    }
+    let folder = beside(&request.path, "registry");
+    let mut registry = Registry::new(catalog, folder.as_deref());
+    for (entry, message) in &registry.problems {
+        let layer = sources.add(super::source::Source {
+            name: entry.place.clone(),
+            path: None,
+            text: entry.text.to_string(),
+            origin: super::source::Origin::Registry,
+        });
+        diagnostics.push(
+            Diagnostic::new(Code::E0205, Span::point(layer, 0), message.clone())
+                .help("give it another name"),
+        );
+    }
+    for name in catalog.twice() {
+        diagnostics.push(Diagnostic::new(
+            Code::E0205,
+            plan.name_span,
+            format!("two ops named `{name}` are linked into this binary"),
+        ));
+    }
+    let data = data::roots(&request.path, environment, sources, diagnostics);
+    let mut resolver = Resolver {
+        catalog,
+        registry: &mut registry,
+        sources,
+        diagnostics,
+        data: &data,
+        environment,
+        imports: BTreeMap::new(),
+        importing: vec![canonical(&request.path)],
+    };
+    let mut cells = Vec::new();
+    for draft in plan.cells {
+        let known = resolver.diagnostics.len();
+        let graph = resolver.graph(&draft.root, draft.seed);
+        if !draft.arm.is_empty() {
+            for diagnostic in &mut resolver.diagnostics[known..] {
+                diagnostic.notes.push(format!("in arm `{}`", draft.arm));
+            }
+        }
+        if let Some(graph) = graph {
+            cells.push(Cell {
+                arm: draft.arm,
+                seed: draft.seed,
+                graph,
+            });
+        }
+    }
+    let mut columns: Vec<String> = cells
+        .iter()
+        .flat_map(|cell| &cell.graph.stages)
+        .flat_map(|stage| stage.description.columns.clone())
+        .collect();
+    columns.sort();
+    columns.dedup();
+    let compare = plan
+        .compare
+        .and_then(|node| resolver.compare(&node, &plan.arms, &columns));
+    Some(Experiment {
+        name: plan.name,
+        about: plan.about,
+        path: request.path.clone(),
+        cells,
+        sweep: is_sweep,
+        compare,
+        data: data
+            .into_iter()
+            .map(|(name, root)| (name, root.path))
+            .collect(),
+        sources: Sources::default(),
+    })
+}
+
+/// The nearest `name` beside a file: in its folder, or in the folder above it.
+pub fn beside(path: &Path, name: &str) -> Option<PathBuf> {
+    let folder = match path.parent() {
+        Some(folder) if !folder.as_os_str().is_empty() => folder.to_owned(),
+        _ => PathBuf::from("."),
+    };
+    let near = folder.join(name);
+    if near.exists() {
+        return Some(near);
+    }
+    let above = std::fs::canonicalize(&folder).ok()?.parent()?.join(name);
+    if !above.exists() {
+        return None;
+    }
+    // Keep what people read short.
+    let short = folder.parent().map(|parent| parent.join(name));
+    match short {
+        Some(short) if short.exists() && !folder.ends_with(".") => Some(short),
+        _ => Some(above),
+    }
+}
+
+/// A name for a file that is the same however it is written.
+pub fn canonical(path: &Path) -> PathBuf {
+    std::fs::canonicalize(path).unwrap_or_else(|_| path.to_owned())
+}
+
+/// Reads a small text file: bounded, never from a pipe or a device.
+///
+/// # Errors
+/// When it is missing, no regular file, too large or not UTF-8.
+pub fn read(path: &Path) -> std::io::Result<String> {
+    let bytes = read_bytes(path)?;
+    yaml::decode(&bytes, 0)
+        .map(str::to_owned)
+        .map_err(|diagnostic| std::io::Error::other(diagnostic.message))
+}
+
+/// Reads at most one byte more than an experiment may have.
+///
+/// # Errors
+/// When it is missing or no regular file.
+pub fn read_bytes(path: &Path) -> std::io::Result<Vec<u8>> {
+    let facts = std::fs::metadata(path)?;
+    if facts.is_dir() {
+        return Err(std::io::Error::other("it is a folder"));
+    }
+    if !facts.is_file() {
+        return Err(std::io::Error::other("it is no regular file"));
+    }
+    let mut bytes = Vec::new();
+    std::fs::File::open(path)?
+        .take(yaml::MAX_BYTES as u64 + 1)
+        .read_to_end(&mut bytes)?;
+    Ok(bytes)
+}
+
+/// The text of a scalar, whatever its type: names may look like numbers.
+pub fn scalar(node: &Node) -> Option<String> {
+    match &node.data {
+        yaml::Data::Text(text) => Some(text.clone()),
+        yaml::Data::Int(_) | yaml::Data::Float(_) | yaml::Data::Bool(_) => Some(node.inline()),
+        _ => None,
+    }
+}
