@@ -1,5 +1,7 @@
 //! A pipeline of small ops that do nothing, and a registry of a few entries: what the language is tested on.
 
+#![allow(clippy::unwrap_used)]
+
 use reviv::experiment::catalog::{Catalog, EntryText};
 use reviv::experiment::diagnostic::Report;
 use reviv::experiment::load::{Request, load_in};
