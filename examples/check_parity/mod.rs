@@ -4,6 +4,7 @@ pub mod report;
 pub mod vectors;
 
 mod optim;
+mod vq;
 
 use std::path::Path;
 
@@ -16,7 +17,7 @@ pub type Outcome<T = ()> = Result<T, Box<dyn std::error::Error>>;
 type Check = fn(&Path, &mut Report) -> Outcome;
 
 /// The folders that are known, and what compares each.
-const FOLDERS: &[(&str, Check)] = &[("optim", optim::check)];
+const FOLDERS: &[(&str, Check)] = &[("optim", optim::check), ("vq", vq::check)];
 
 /// Compares everything below `folder`: one known folder, or a set of them.
 pub fn check(folder: &Path) -> Outcome<Report> {

@@ -10,12 +10,23 @@ use super::Compute;
 use super::parameters::{Kind, Parameter, join};
 use crate::random::stream;
 
+/// What values the parameters get.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Fill {
+    Drawn {
+        seed: u64,
+    },
+    /// All will be loaded.
+    Zeros,
+    /// Shapes only.
+    Nothing,
+}
+
 /// The place in a model under construction: device, seed and path.
 #[derive(Debug, Clone)]
 pub struct Initialise<'a> {
     compute: &'a Compute,
-    /// `None` when all values will be loaded: parameters start as zeros.
-    seed: Option<u64>,
+    values: Fill,
     path: String,
 }
 
@@ -25,7 +36,7 @@ impl<'a> Initialise<'a> {
     pub fn new(compute: &'a Compute, seed: u64) -> Self {
         Self {
             compute,
-            seed: Some(seed),
+            values: Fill::Drawn { seed },
             path: String::new(),
         }
     }
@@ -35,7 +46,17 @@ impl<'a> Initialise<'a> {
     pub fn to_load(compute: &'a Compute) -> Self {
         Self {
             compute,
-            seed: None,
+            values: Fill::Zeros,
+            path: String::new(),
+        }
+    }
+
+    /// A model that is only looked at: names, shapes and counts, no memory.
+    #[must_use]
+    pub fn planned(compute: &'a Compute) -> Self {
+        Self {
+            compute,
+            values: Fill::Nothing,
             path: String::new(),
         }
     }
@@ -60,7 +81,16 @@ impl<'a> Initialise<'a> {
         self.compute
     }
 
-    fn parameter(&self, kind: Kind, values: Vec<f32>, shape: &[usize]) -> Parameter {
+    fn parameter(
+        &self,
+        kind: Kind,
+        shape: &[usize],
+        values: impl FnOnce(usize) -> Vec<f32>,
+    ) -> Parameter {
+        if self.values == Fill::Nothing {
+            return Parameter::planned(kind, shape);
+        }
+        let values = values(shape.iter().product());
         Parameter::new(kind, values, shape, self.compute.device())
     }
 
@@ -70,20 +100,14 @@ impl<'a> Initialise<'a> {
         shape: &[usize],
         draw: impl Fn(&mut crate::random::StreamRng) -> f32,
     ) -> Parameter {
-        let length = shape.iter().product();
-        let values = match self.seed {
-            None => vec![0.0; length],
-            Some(seed) => {
-                let mut random = stream(
-                    seed,
-                    &format!("initialise.{}", join(&self.path, name)),
-                    0,
-                    0,
-                );
+        self.parameter(Kind::Trainable, shape, |length| match self.values {
+            Fill::Drawn { seed } => {
+                let stream_name = format!("initialise.{}", join(&self.path, name));
+                let mut random = stream(seed, &stream_name, 0, 0);
                 (0..length).map(|_| draw(&mut random)).collect()
             }
-        };
-        self.parameter(Kind::Trainable, values, shape)
+            Fill::Zeros | Fill::Nothing => vec![0.0; length],
+        })
     }
 
     /// Uniform in `[-bound, bound)`.
@@ -110,13 +134,13 @@ impl<'a> Initialise<'a> {
     /// All `value`, trainable.
     #[must_use]
     pub fn constant(&self, shape: &[usize], value: f32) -> Parameter {
-        self.parameter(Kind::Trainable, vec![value; shape.iter().product()], shape)
+        self.parameter(Kind::Trainable, shape, |length| vec![value; length])
     }
 
     /// Given values that no optimizer changes.
     #[must_use]
-    pub fn fixed(&self, values: Vec<f32>, shape: &[usize]) -> Parameter {
-        self.parameter(Kind::Fixed, values, shape)
+    pub fn fixed(&self, shape: &[usize], values: impl FnOnce() -> Vec<f32>) -> Parameter {
+        self.parameter(Kind::Fixed, shape, |_| values())
     }
 }
 

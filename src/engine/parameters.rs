@@ -25,7 +25,7 @@ pub enum Kind {
 pub struct Parameter {
     shape: Vec<usize>,
     kind: Kind,
-    /// Flat; `shape` is applied on use. `None` only while an optimizer has the values out.
+    /// Flat; `shape` is applied on use. `None` while an optimizer has the values out, and in models that are only planned.
     values: Option<Tensor<1>>,
 }
 
@@ -41,6 +41,16 @@ impl Parameter {
             shape: shape.to_vec(),
             kind,
             values: Some(flat(values, device)),
+        }
+    }
+
+    /// A parameter without values: for counting and planning.
+    #[must_use]
+    pub fn planned(kind: Kind, shape: &[usize]) -> Self {
+        Self {
+            shape: shape.to_vec(),
+            kind,
+            values: None,
         }
     }
 
@@ -68,7 +78,7 @@ impl Parameter {
     /// The values at their shape; part of the autodiff graph while the model trains.
     ///
     /// # Panics
-    /// When `D` is not the rank.
+    /// When `D` is not the rank, or the model is only planned.
     #[must_use]
     pub fn tensor<const D: usize>(&self) -> Tensor<D> {
         let shape: [usize; D] = self
@@ -90,7 +100,7 @@ impl Parameter {
     pub fn flat(&self) -> Tensor<1> {
         self.values
             .clone()
-            .expect("the optimizer puts the values back")
+            .expect("a model that computes has values")
     }
 
     /// The values, flat, outside any autodiff graph.
@@ -103,7 +113,7 @@ impl Parameter {
     pub fn take(&mut self) -> Tensor<1> {
         self.values
             .take()
-            .expect("the optimizer puts the values back")
+            .expect("a model that computes has values")
             .without_autodiff()
     }
 

@@ -1,6 +1,9 @@
 //! Tokenizers: every modality becomes a grid of discrete tokens and back (Sec. 4.2, Supp. A).
 
+pub mod normaliser;
+pub mod patches;
 pub mod quantizer;
+pub mod vq;
 
 use crate::clip::Signal;
 

@@ -95,14 +95,17 @@ impl Quantizer {
     pub fn new(place: &Initialise<'_>, settings: &QuantizerSettings) -> Self {
         let place = place.at("_codebook");
         let (codes, width) = (settings.codebook, settings.code_width);
-        let drawn = place.uniform("embed", &[codes, width], (6.0 / width as f64).sqrt());
-        let mut directions = drawn.to_vec();
-        normalise(&mut directions, width);
+        let directions = || {
+            let bound = (6.0 / width as f64).sqrt();
+            let mut drawn = place.uniform("embed", &[codes, width], bound).to_vec();
+            normalise(&mut drawn, width);
+            drawn
+        };
         Self {
             state: State {
-                initted: place.fixed(vec![1.0], &[1]),
-                cluster_size: place.fixed(vec![0.0; codes], &[codes]),
-                embed: place.fixed(directions, &[codes, width]),
+                initted: place.fixed(&[1], || vec![1.0]),
+                cluster_size: place.fixed(&[codes], || vec![0.0; codes]),
+                embed: place.fixed(&[codes, width], directions),
             },
             settings: settings.clone(),
         }

@@ -7,3 +7,4 @@ mod trajectories;
 
 mod language;
 mod language_ops;
+mod vq_structure;

@@ -1,0 +1,170 @@
+//! Statistics that bring a modality's values to mean 0 and deviation 1; fitted on the training split, stored with the weights.
+
+use super::TokenizerError;
+use crate::clip::Signal;
+
+/// One mean and deviation per value of a sample (camera 9, gaze 2, joints 21 x 3).
+#[derive(Debug, Clone, PartialEq)]
+pub struct Normaliser {
+    mean: Vec<f32>,
+    deviation: Vec<f32>,
+}
+
+/// Deviations below this are those of constant values, which are left unscaled.
+const CONSTANT_BELOW: f64 = 1e-6;
+
+impl Normaliser {
+    /// Given statistics.
+    ///
+    /// # Errors
+    /// When they differ in length, or one is not finite, or a deviation not positive.
+    pub fn new(mean: Vec<f32>, deviation: Vec<f32>) -> Result<Self, TokenizerError> {
+        let usable = mean.len() == deviation.len()
+            && mean.iter().all(|value| value.is_finite())
+            && deviation
+                .iter()
+                .all(|value| value.is_finite() && *value > 0.0);
+        if !usable {
+            return Err(TokenizerError::Other(format!(
+                "normalisation needs as many finite means as positive deviations, found {} and {}",
+                mean.len(),
+                deviation.len()
+            )));
+        }
+        Ok(Self { mean, deviation })
+    }
+
+    /// The same mean and deviation for all `width` values: gaze in `[0, 1]` becomes `[-1, 1]` with `(0.5, 0.5)`.
+    ///
+    /// # Errors
+    /// As [`Normaliser::new`].
+    pub fn constant(width: usize, mean: f32, deviation: f32) -> Result<Self, TokenizerError> {
+        Self::new(vec![mean; width], vec![deviation; width])
+    }
+
+    /// Statistics over the valid values of `signals`, whose samples have `width` values each.
+    ///
+    /// # Errors
+    /// When some value has no valid sample, or a valid one is not finite.
+    pub fn fit<'a>(
+        signals: impl Iterator<Item = &'a Signal> + Clone,
+        width: usize,
+    ) -> Result<Self, TokenizerError> {
+        let mut count = vec![0_u64; width];
+        let mut sum = vec![0.0_f64; width];
+        for signal in signals.clone() {
+            each_valid(signal, |i, value| {
+                count[i % width] += 1;
+                sum[i % width] += value;
+            });
+        }
+        if count.contains(&0) || sum.iter().any(|sum| !sum.is_finite()) {
+            return Err(TokenizerError::Other(
+                "normalisation cannot be fitted: a value is never valid, or not finite".to_owned(),
+            ));
+        }
+        let mean: Vec<f64> = sum
+            .iter()
+            .zip(&count)
+            .map(|(sum, n)| sum / *n as f64)
+            .collect();
+        let mut square = vec![0.0_f64; width];
+        for signal in signals {
+            each_valid(signal, |i, value| {
+                square[i % width] += (value - mean[i % width]).powi(2);
+            });
+        }
+        let deviation = square.iter().zip(&count).map(|(square, n)| {
+            let deviation = (square / *n as f64).sqrt();
+            if deviation < CONSTANT_BELOW {
+                1.0
+            } else {
+                deviation as f32
+            }
+        });
+        Self::new(
+            mean.iter().map(|value| *value as f32).collect(),
+            deviation.collect(),
+        )
+    }
+
+    /// How many values a sample has.
+    #[must_use]
+    pub fn width(&self) -> usize {
+        self.mean.len()
+    }
+
+    #[must_use]
+    pub fn mean(&self) -> &[f32] {
+        &self.mean
+    }
+
+    #[must_use]
+    pub fn deviation(&self) -> &[f32] {
+        &self.deviation
+    }
+
+    /// `(value - mean) / deviation`, in place; `values` is whole samples.
+    pub fn apply(&self, values: &mut [f32]) {
+        for sample in values.chunks_mut(self.width()) {
+            for ((value, mean), deviation) in sample.iter_mut().zip(&self.mean).zip(&self.deviation)
+            {
+                *value = (*value - mean) / deviation;
+            }
+        }
+    }
+
+    /// The inverse of [`Normaliser::apply`].
+    pub fn undo(&self, values: &mut [f32]) {
+        for sample in values.chunks_mut(self.width()) {
+            for ((value, mean), deviation) in sample.iter_mut().zip(&self.mean).zip(&self.deviation)
+            {
+                *value = *value * deviation + mean;
+            }
+        }
+    }
+}
+
+/// Calls `visit` with the index and value of every element of `signal` that is valid.
+fn each_valid(signal: &Signal, mut visit: impl FnMut(usize, f64)) {
+    let channels = signal.values.shape().last().copied().unwrap_or(1).max(1);
+    let valid: Option<Vec<bool>> = signal
+        .valid
+        .as_ref()
+        .map(|valid| valid.iter().copied().collect());
+    for (i, value) in signal.values.iter().enumerate() {
+        if valid.as_ref().is_none_or(|valid| valid[i / channels]) {
+            visit(i, f64::from(*value));
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ndarray::{ArrayD, IxDyn};
+
+    #[test]
+    fn fitting_ignores_invalid_samples_and_undoing_restores() {
+        let values = vec![1.0, 10.0, f32::NAN, f32::NAN, 3.0, 10.0];
+        let signal = Signal {
+            values: ArrayD::from_shape_vec(IxDyn(&[3, 2]), values).unwrap(),
+            valid: Some(ArrayD::from_shape_vec(IxDyn(&[3]), vec![true, false, true]).unwrap()),
+        };
+        let normaliser = Normaliser::fit(std::iter::once(&signal), 2).unwrap();
+        assert_eq!(normaliser.mean(), [2.0, 10.0]);
+        assert_eq!(normaliser.deviation(), [1.0, 1.0]);
+        let mut sample = [5.0, 12.0];
+        normaliser.apply(&mut sample);
+        assert_eq!(sample, [3.0, 2.0]);
+        normaliser.undo(&mut sample);
+        assert_eq!(sample, [5.0, 12.0]);
+    }
+
+    #[test]
+    fn statistics_that_cannot_normalise_are_refused() {
+        assert!(Normaliser::new(vec![0.0], vec![0.0]).is_err());
+        assert!(Normaliser::new(vec![0.0, 1.0], vec![1.0]).is_err());
+        assert!(Normaliser::new(vec![f32::NAN], vec![1.0]).is_err());
+    }
+}

@@ -1,0 +1,537 @@
+//! The VQ-VAE of camera, gaze, hands and body (Supp. A): patches, transformer, codebook, transformer, patches.
+//!
+//! One model for signals over time ([`super::temporal`]) and for joints over time ([`super::kinematic`]); they differ in how
+//! patches are cut and in the position table. Suffixes: `N` tokens of all samples, `P` values of a patch, `D` width, `L` code
+//! width.
+
+use burn::tensor::{Tensor, TensorData};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use super::TokenizerError;
+use super::patches::Patches;
+use super::quantizer::{Assignment, Quantizer, QuantizerSettings};
+use crate::engine::parameters::to_host;
+use crate::engine::{Initialise, Parameter, Segments, ops, parameters};
+use crate::modality::Shape;
+use crate::nn::positions::{self, GridOrder};
+use crate::nn::{Block, LayerNorm, Linear, Mlp};
+
+/// What reconstruction is measured by while training; values are normalised.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Loss {
+    /// Mean of squared errors over all values.
+    Mse,
+    /// Sum of squared errors of valid samples (or joints) divided by how many there are.
+    #[default]
+    MaskedMse,
+}
+
+/// The sizes of a VQ-VAE.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct VqSettings {
+    /// How many codes there are: the vocabulary.
+    pub codebook: usize,
+    /// Values per code.
+    pub code_width: usize,
+    /// Samples per token, and joints per token for joints: `[2]`, `[2, 3]`.
+    pub compression: Vec<usize>,
+    /// Width of the transformers.
+    pub width: usize,
+    /// Blocks of the encoder, and of the decoder.
+    pub depth: usize,
+    /// Attention heads; they divide the width.
+    pub heads: usize,
+    /// Width inside the MLPs, in widths.
+    pub mlp_ratio: usize,
+    /// What is minimised.
+    pub loss: Loss,
+    /// Decay of the running means of codes and counts.
+    pub ema_decay: f64,
+    /// Codes with a smaller running count are replaced by latents of the batch.
+    pub dead_below: f64,
+    /// Weight of the loss that pulls latents to their codes.
+    pub commitment: f64,
+    /// How the position table of a grid of joints is enumerated.
+    pub positions: GridOrder,
+}
+
+impl Default for VqSettings {
+    /// The paper's sizes (ViT-B), for signals over time.
+    fn default() -> Self {
+        Self {
+            codebook: 512,
+            code_width: 32,
+            compression: vec![2],
+            width: 768,
+            depth: 12,
+            heads: 12,
+            mlp_ratio: 4,
+            loss: Loss::MaskedMse,
+            ema_decay: 0.99,
+            dead_below: 2.0,
+            commitment: 1.0,
+            positions: GridOrder::Released,
+        }
+    }
+}
+
+impl VqSettings {
+    /// How signals of `shape` are cut.
+    ///
+    /// # Errors
+    /// When a size is impossible.
+    pub fn patches(&self, shape: &Shape) -> Result<Patches, TokenizerError> {
+        let wrong = |what: String| Err(TokenizerError::Other(what));
+        let divisor = if matches!(shape, Shape::Kinematic { .. }) {
+            4
+        } else {
+            2
+        };
+        if self.width == 0 || !self.width.is_multiple_of(divisor) {
+            return wrong(format!(
+                "width {} is not a multiple of {divisor}, which the position table needs",
+                self.width
+            ));
+        }
+        if self.heads == 0 || !self.width.is_multiple_of(self.heads) {
+            return wrong(format!(
+                "{} heads do not divide width {}",
+                self.heads, self.width
+            ));
+        }
+        if self.codebook == 0 || self.code_width == 0 || self.depth == 0 || self.mlp_ratio == 0 {
+            return wrong("codebook, code_width, depth and mlp_ratio are at least 1".to_owned());
+        }
+        if !(0.0..1.0).contains(&self.ema_decay) || self.dead_below < 0.0 || self.commitment < 0.0 {
+            return wrong(
+                "ema_decay lies in [0, 1), dead_below and commitment are not negative".to_owned(),
+            );
+        }
+        Patches::new(shape, &self.compression)
+    }
+
+    fn quantizer(&self) -> QuantizerSettings {
+        QuantizerSettings {
+            codebook: self.codebook,
+            code_width: self.code_width,
+            decay: self.ema_decay,
+            dead_below: self.dead_below,
+            commitment: self.commitment,
+        }
+    }
+}
+
+/// A linear map stored as a convolution whose kernel covers its input.
+#[derive(Debug, Clone)]
+struct Convolution {
+    weight: Parameter,
+    bias: Parameter,
+}
+parameters!(Convolution { weight, bias });
+
+impl Convolution {
+    /// `[N, in]` to `[N, out]`.
+    fn forward(&self, x: Tensor<2>) -> Tensor<2> {
+        let outputs = self.weight.shape()[0];
+        let inputs = self.weight.len() / outputs;
+        ops::linear(
+            x,
+            self.weight.reshaped([outputs, inputs]),
+            Some(self.bias.tensor()),
+        )
+    }
+
+    /// Weight and bias uniform in `+- 1 / sqrt(fan in)`, or a Xavier weight.
+    fn new(place: &Initialise<'_>, shape: &[usize], xavier: bool) -> Self {
+        let (outputs, kernel) = (shape[0], shape[2..].iter().product::<usize>());
+        let fan_in = shape[1] * kernel;
+        let bound = 1.0 / (fan_in as f64).sqrt();
+        Self {
+            weight: if xavier {
+                place.xavier("weight", shape, fan_in, outputs * kernel)
+            } else {
+                place.uniform("weight", shape, bound)
+            },
+            bias: place.uniform("bias", &[outputs], bound),
+        }
+    }
+}
+
+/// Positions, blocks, and one MLP with tanh: the part encoder and decoder have in common.
+#[derive(Debug, Clone)]
+struct Transformer {
+    /// `[1, rows(, columns), D]`.
+    position_embeddings: Parameter,
+    blocks: Vec<Block>,
+    norm_mlp: LayerNorm,
+    post_mlp: Mlp,
+}
+parameters!(Transformer {
+    position_embeddings,
+    blocks,
+    norm_mlp,
+    post_mlp
+});
+
+impl Transformer {
+    fn new(place: &Initialise<'_>, settings: &VqSettings, patches: &Patches) -> Self {
+        let (width, hidden) = (settings.width, settings.width * settings.mlp_ratio);
+        let [rows, columns] = patches.rows_columns();
+        let table = || {
+            if patches.is_kinematic() {
+                positions::grid(rows, columns, width, settings.positions)
+            } else {
+                positions::line(rows, width)
+            }
+        };
+        let mut shape = vec![1];
+        shape.extend(patches.grid());
+        shape.push(width);
+        let blocks = place.at("blocks");
+        Self {
+            position_embeddings: place.fixed(&shape, table),
+            blocks: (0..settings.depth)
+                .map(|i| Block::new(&blocks.item(i), width, settings.heads, hidden))
+                .collect(),
+            norm_mlp: LayerNorm::new(&place.at("norm_mlp"), width, true),
+            post_mlp: Mlp::new(&place.at("post_mlp"), width, hidden, true),
+        }
+    }
+
+    /// `[N, D]` of `samples` signals to `[N, D]`.
+    fn forward(&self, h_ND: Tensor<2>, samples: usize) -> Tensor<2> {
+        let [tokens, width] = h_ND.dims();
+        let each = tokens / samples;
+        let table = self.position_embeddings.reshaped([1, each, width]);
+        let h_ND = (h_ND.reshape([samples, each, width]) + table).reshape([tokens, width]);
+        let segments = Segments::batch(samples, each);
+        let h_ND = self
+            .blocks
+            .iter()
+            .fold(h_ND, |h_ND, block| block.forward(h_ND, &segments));
+        h_ND.clone() + self.post_mlp.forward_tanh(self.norm_mlp.forward(h_ND))
+    }
+}
+
+/// Patches to hidden states.
+#[derive(Debug, Clone)]
+struct Encoder {
+    conv: Convolution,
+    transformer: Transformer,
+}
+parameters!(Encoder { conv, transformer => "" });
+
+/// Hidden states to patches.
+#[derive(Debug, Clone)]
+struct Decoder {
+    transformer: Transformer,
+    out_proj: Linear,
+}
+parameters!(Decoder { transformer => "", out_proj });
+
+/// The model; its parameters are named as in released checkpoints.
+#[derive(Debug, Clone)]
+pub struct VqVae {
+    encoder: Encoder,
+    quant_proj: Convolution,
+    quantize: Quantizer,
+    decoder: Decoder,
+    post_quant_proj: Convolution,
+    patches: Patches,
+    settings: VqSettings,
+}
+parameters!(VqVae {
+    encoder,
+    quant_proj,
+    quantize,
+    decoder,
+    post_quant_proj
+});
+
+/// Patches of a batch of normalised signals.
+#[derive(Debug, Clone)]
+pub struct Batch {
+    /// `[N, P]`, zero where invalid.
+    values_NP: Tensor<2>,
+    /// `[N, P]`, 1 where valid; `None`: all are.
+    valid_NP: Option<Tensor<2>>,
+    samples: usize,
+    /// Valid samples (or joints) in all.
+    valid: f64,
+}
+
+/// What one training forward pass gives.
+#[derive(Debug)]
+pub struct Trained {
+    /// Reconstruction plus weighted commitment, `[1]`: what to minimise.
+    pub loss: Tensor<1>,
+    /// The two parts.
+    pub reconstruction: f64,
+    pub commitment: f64,
+    /// For the codebook's update.
+    pub assignment: Assignment,
+}
+
+impl VqVae {
+    /// A model for signals of `shape`.
+    ///
+    /// # Errors
+    /// When the settings do not fit each other or the shape.
+    pub fn new(
+        place: &Initialise<'_>,
+        settings: &VqSettings,
+        shape: &Shape,
+    ) -> Result<Self, TokenizerError> {
+        let patches = settings.patches(shape)?;
+        let (width, code) = (settings.width, settings.code_width);
+        let (encoder, decoder) = (place.at("encoder"), place.at("decoder"));
+        let kernel = patches.convolution(width, patches.channels(), true);
+        let to_code = patches.convolution(code, width, false);
+        let from_code = patches.convolution(width, code, false);
+        Ok(Self {
+            encoder: Encoder {
+                conv: Convolution::new(&encoder.at("conv"), &kernel, true),
+                transformer: Transformer::new(&encoder, settings, &patches),
+            },
+            quant_proj: Convolution::new(&place.at("quant_proj"), &to_code, false),
+            quantize: Quantizer::new(&place.at("quantize"), &settings.quantizer()),
+            decoder: Decoder {
+                transformer: Transformer::new(&decoder, settings, &patches),
+                out_proj: Linear::new(&decoder.at("out_proj"), width, patches.width(), true),
+            },
+            post_quant_proj: Convolution::new(&place.at("post_quant_proj"), &from_code, false),
+            patches,
+            settings: settings.clone(),
+        })
+    }
+
+    #[must_use]
+    pub fn patches(&self) -> &Patches {
+        &self.patches
+    }
+
+    #[must_use]
+    pub fn settings(&self) -> &VqSettings {
+        &self.settings
+    }
+
+    #[must_use]
+    pub fn quantizer(&self) -> &Quantizer {
+        &self.quantize
+    }
+
+    pub fn quantizer_mut(&mut self) -> &mut Quantizer {
+        &mut self.quantize
+    }
+
+    /// A batch of normalised signals, each `(values, validity)` row-major; values that are not valid count as zeros.
+    ///
+    /// # Panics
+    /// When a signal does not have the model's shape.
+    #[must_use]
+    pub fn batch<'a>(
+        &self,
+        signals: impl IntoIterator<Item = (&'a [f32], Option<&'a [bool]>)>,
+    ) -> Batch {
+        let channels = self.patches.channels();
+        let (mut values, mut flags) = (Vec::new(), Vec::new());
+        let (mut samples, mut valid, mut masked) = (0, 0_usize, false);
+        for (signal, validity) in signals {
+            samples += 1;
+            let is_valid = |i: usize| validity.is_none_or(|valid| valid[i / channels]);
+            let clean: Vec<f32> = (0..signal.len())
+                .map(|i| if is_valid(i) { signal[i] } else { 0.0 })
+                .collect();
+            self.patches.cut(&clean, &mut values);
+            let flag: Vec<f32> = (0..signal.len())
+                .map(|i| f32::from(u8::from(is_valid(i))))
+                .collect();
+            self.patches.cut(&flag, &mut flags);
+            let count = (0..signal.len() / channels)
+                .filter(|i| is_valid(i * channels))
+                .count();
+            valid += count;
+            masked |= count < signal.len() / channels;
+        }
+        let device = self.encoder.conv.bias.untracked().device();
+        let shape = [samples * self.patches.tokens(), self.patches.width()];
+        let tensor = |data: Vec<f32>| Tensor::from_data(TensorData::new(data, shape), &device);
+        Batch {
+            values_NP: tensor(values),
+            valid_NP: masked.then(|| tensor(flags)),
+            samples,
+            valid: valid as f64,
+        }
+    }
+
+    /// Hidden states of the encoder, `[N, D]`.
+    #[must_use]
+    pub fn encode_hidden(&self, batch: &Batch) -> Tensor<2> {
+        let h_ND = self.encoder.conv.forward(batch.values_NP.clone());
+        self.encoder.transformer.forward(h_ND, batch.samples)
+    }
+
+    /// Latents before quantisation, `[N, L]`, of hidden states.
+    #[must_use]
+    pub fn latents(&self, h_ND: Tensor<2>) -> Tensor<2> {
+        self.quant_proj.forward(h_ND)
+    }
+
+    /// Reconstructed patches, `[N, P]`, of `samples` signals from quantised latents `[N, L]`.
+    #[must_use]
+    pub fn decode_latents(&self, q_NL: Tensor<2>, samples: usize) -> Tensor<2> {
+        let h_ND = self.post_quant_proj.forward(q_NL);
+        let h_ND = self.decoder.transformer.forward(h_ND, samples);
+        self.decoder.out_proj.forward(h_ND)
+    }
+
+    /// Tokens of a batch, `[N]`.
+    #[must_use]
+    pub fn encode(&self, batch: &Batch) -> Vec<u32> {
+        let z_NL = self.latents(self.encode_hidden(batch));
+        self.quantize.assign(to_host(z_NL)).ids
+    }
+
+    /// Reconstructed patches, `[N, P]`, of `samples` signals from tokens `[N]`.
+    ///
+    /// # Panics
+    /// When a token is outside the vocabulary.
+    #[must_use]
+    pub fn decode(&self, ids: &[u32], samples: usize) -> Tensor<2> {
+        self.decode_latents(self.codes(ids), samples)
+    }
+
+    /// The codes of `ids` as a tensor, `[N, L]`.
+    fn codes(&self, ids: &[u32]) -> Tensor<2> {
+        let device = self.encoder.conv.bias.untracked().device();
+        let shape = [ids.len(), self.settings.code_width];
+        Tensor::from_data(TensorData::new(self.quantize.look_up(ids), shape), &device)
+    }
+
+    /// The reconstruction loss of patches, `[1]`.
+    #[must_use]
+    pub fn loss(&self, found_NP: Tensor<2>, batch: &Batch) -> Tensor<1> {
+        let square_NP = (found_NP - batch.values_NP.clone()).square();
+        match self.settings.loss {
+            Loss::Mse => square_NP.mean(),
+            Loss::MaskedMse => {
+                let square_NP = match &batch.valid_NP {
+                    Some(valid_NP) => square_NP * valid_NP.clone(),
+                    None => square_NP,
+                };
+                square_NP.sum() / batch.valid.max(1.0)
+            }
+        }
+    }
+
+    /// One forward pass with straight-through codes: gradients pass the codebook as if it were not there, and the commitment
+    /// loss pulls latents to their codes. The codebook itself is moved by [`Quantizer::update`].
+    #[must_use]
+    pub fn forward_training(&self, batch: &Batch) -> Trained {
+        let z_NL = self.latents(self.encode_hidden(batch));
+        let assignment = self.quantize.assign(to_host(z_NL.clone()));
+        let q_NL = self.codes(&assignment.ids);
+        let step_NL = q_NL - z_NL.clone();
+        let commitment = step_NL.clone().square().mean();
+        let found_NP = self.decode_latents(z_NL + step_NL.detach(), batch.samples);
+        let reconstruction = self.loss(found_NP, batch);
+        let scalar = |x: &Tensor<1>| f64::from(to_host(x.clone())[0]);
+        Trained {
+            reconstruction: scalar(&reconstruction),
+            commitment: scalar(&commitment),
+            loss: reconstruction + commitment * self.settings.commitment,
+            assignment,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::engine::{Compute, Parameters};
+
+    fn planned(settings: &VqSettings, shape: &Shape) -> VqVae {
+        let compute = Compute::cpu();
+        VqVae::new(&Initialise::planned(&compute), settings, shape).unwrap()
+    }
+
+    /// Trainable parameters as counted on the released constructors (technical reference, 2.1).
+    #[test]
+    fn the_paper_sizes_have_the_published_parameter_counts() {
+        let temporal = |channels| Shape::Temporal {
+            samples: 60,
+            channels,
+        };
+        let sizes = VqSettings::default();
+        assert_eq!(planned(&sizes, &temporal(9)).count(), 179_635_250);
+        assert_eq!(planned(&sizes, &temporal(2)).count(), 179_613_732);
+        let joints = VqSettings {
+            compression: vec![2, 3],
+            ..sizes
+        };
+        let body = planned(
+            &joints,
+            &Shape::Kinematic {
+                samples: 60,
+                joints: 21,
+            },
+        );
+        assert_eq!(body.count(), 179_635_250);
+        assert_eq!(body.inventory().len(), 313);
+    }
+
+    #[test]
+    fn sizes_that_do_not_fit_are_refused_with_the_numbers() {
+        let shape = Shape::Kinematic {
+            samples: 60,
+            joints: 21,
+        };
+        for (settings, number) in [
+            (
+                VqSettings {
+                    width: 30,
+                    ..joint_settings()
+                },
+                "30",
+            ),
+            (
+                VqSettings {
+                    heads: 5,
+                    ..joint_settings()
+                },
+                "5 heads",
+            ),
+            (
+                VqSettings {
+                    codebook: 0,
+                    ..joint_settings()
+                },
+                "codebook",
+            ),
+            (
+                VqSettings {
+                    compression: vec![2, 4],
+                    ..joint_settings()
+                },
+                "[2, 4]",
+            ),
+        ] {
+            let message = settings.patches(&shape).unwrap_err().to_string();
+            assert!(message.contains(number), "{message}");
+        }
+    }
+
+    fn joint_settings() -> VqSettings {
+        VqSettings {
+            compression: vec![2, 3],
+            width: 24,
+            heads: 2,
+            depth: 1,
+            codebook: 8,
+            ..VqSettings::default()
+        }
+    }
+}
