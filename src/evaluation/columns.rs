@@ -145,7 +145,7 @@ pub const PER_CLIP: &[Entry] = &[
         "camera.position",
         "m",
         Lower,
-        "mean position error without any alignment",
+        "mean position error without any alignment, first poses laid on each other",
     ),
     (
         "gaze.mse",
@@ -196,6 +196,12 @@ pub const PER_CLIP: &[Entry] = &[
         "%",
         Higher,
         "pixels within a factor 1.25, as predicted",
+    ),
+    (
+        "rgb.psnr",
+        "dB",
+        Higher,
+        "peak signal-to-noise ratio of the colour video",
     ),
 ];
 

@@ -1,7 +1,8 @@
 //! Metrics, statistics and tables (Sec. 5).
 //!
 //! Read in this order: [`outcome`] (what a metric can say), the metrics [`joints`], [`trajectory`], [`gaze`], [`depth`],
-//! [`motion`], [`tokens`], [`runtime`].
+//! [`motion`], [`tokens`], [`runtime`]; then [`evaluate`] (every clip of a [`suite`] into [`scores`]), [`statistics`], and [`compare`]
+//! (many scores into one [`table`], which [`render`] prints). [`tum`] compares trajectory files.
 //!
 //! Arithmetic is f64; inputs are metres and seconds; angles are reported in degrees.
 
@@ -9,17 +10,28 @@
     clippy::needless_pass_by_value,
     reason = "array views are passed by value, as ndarray does"
 )]
+#![allow(
+    clippy::ref_option,
+    reason = "signals of a clip are optional fields, handed on as they are"
+)]
 
 pub mod columns;
+pub mod compare;
 pub mod depth;
+pub mod evaluate;
 pub mod gaze;
 pub mod joints;
 pub mod motion;
 pub mod outcome;
+pub mod published;
+pub mod render;
 pub mod runtime;
 pub mod sample;
+mod score_clip;
 pub mod scores;
 pub mod statistics;
+pub mod suite;
+pub mod table;
 pub mod tokens;
 pub mod trajectory;
 pub mod tum;

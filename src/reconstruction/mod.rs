@@ -1,1 +1,3 @@
 //! From decoded signals to a metric reconstruction of a whole video (Sec. 4.1, Supp. D).
+
+pub mod predictions;

@@ -1,0 +1,507 @@
+//! Many scores, one table: entrants side by side, paired on common clips and seeds.
+
+use super::columns::Column;
+use super::outcome::{Outcome, mean};
+use super::published::Published;
+use super::scores::{ScoreSet, Scores};
+use super::statistics::{
+    Difference, Interval, Over, RESAMPLES, Summary, bootstrap_mean, holm, paired_difference,
+    student_interval, summarise,
+};
+use super::table::{Cell, Row, RowKind, Table};
+use serde::{Deserialize, Serialize};
+use std::collections::{BTreeMap, BTreeSet};
+
+/// One row to be: an arm, a run, another system. Several scores are the same thing under several seeds.
+#[derive(Debug, Clone)]
+pub struct Entrant {
+    pub label: String,
+    pub seeds: Vec<Scores>,
+}
+
+/// How a comparison is made.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct CompareSettings {
+    /// Columns in this order; `depth.abs_rel` stands for all its spaces. Empty: all that any entrant has.
+    pub columns: Vec<String>,
+    /// The entrant that all others are tested against.
+    pub baseline: Option<String>,
+    /// Published rows beside the table, a registry entry of kind `published`.
+    pub against: Option<String>,
+    pub interval: IntervalSettings,
+    /// Show the trivial baselines.
+    pub trivial_baselines: bool,
+}
+
+/// Which intervals are printed.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct IntervalSettings {
+    /// Confidence level.
+    #[schemars(range(min = 0.5, max = 0.999))]
+    pub level: f64,
+    /// What varies. With both, the wider of the two is printed.
+    pub over: Vec<Over>,
+    /// Bootstrap draws.
+    #[schemars(range(min = 100))]
+    pub resamples: usize,
+    /// Seed of the bootstrap.
+    pub seed: u64,
+}
+
+impl Default for CompareSettings {
+    fn default() -> Self {
+        Self {
+            columns: Vec::new(),
+            baseline: None,
+            against: None,
+            interval: IntervalSettings::default(),
+            trivial_baselines: true,
+        }
+    }
+}
+
+impl Default for IntervalSettings {
+    fn default() -> Self {
+        Self {
+            level: 0.95,
+            over: vec![Over::Seeds, Over::Clips],
+            resamples: RESAMPLES,
+            seed: 0,
+        }
+    }
+}
+
+/// Why scores cannot stand in one table.
+#[derive(Debug, thiserror::Error, PartialEq, Eq)]
+pub enum CompareError {
+    #[error("nothing to compare")]
+    Nothing,
+    #[error("no clip is common to all: `{first}` and `{other}` were evaluated on different clips")]
+    NoCommonClips { first: String, other: String },
+    #[error("no entrant is called `{name}`; there are {known:?}")]
+    UnknownBaseline { name: String, known: Vec<String> },
+    #[error("no entrant has a column `{name}`")]
+    UnknownColumn { name: String, known: Vec<String> },
+}
+
+/// The table of `entrants`, with `published` rows below.
+///
+/// # Errors
+/// When there is nothing to compare, a name is unknown, or two entrants share no clip.
+pub fn compare(
+    title: &str,
+    entrants: &[Entrant],
+    settings: &CompareSettings,
+    published: Option<&Published>,
+) -> Result<Table, CompareError> {
+    let first = entrants
+        .iter()
+        .find(|e| !e.seeds.is_empty())
+        .ok_or(CompareError::Nothing)?;
+    let columns = columns(entrants, &settings.columns)?;
+    let baseline =
+        match &settings.baseline {
+            None => None,
+            Some(name) => Some(entrants.iter().position(|e| &e.label == name).ok_or_else(
+                || CompareError::UnknownBaseline {
+                    name: name.clone(),
+                    known: entrants.iter().map(|e| e.label.clone()).collect(),
+                },
+            )?),
+        };
+    let common = common_clips(first, entrants)?;
+    let sides: Vec<Side> = entrants
+        .iter()
+        .map(|entrant| Side {
+            sets: entrant
+                .seeds
+                .iter()
+                .map(|s| On::of(s, &s.own, &common))
+                .collect(),
+        })
+        .collect();
+    let mut rows = Vec::new();
+    for (entrant, side) in entrants.iter().zip(&sides) {
+        rows.push(Row {
+            label: entrant.label.clone(),
+            kind: RowKind::System,
+            cells: columns
+                .iter()
+                .map(|column| side.cell(column, &settings.interval))
+                .collect(),
+        });
+    }
+    if let Some(reference) = baseline {
+        add_differences(&mut rows, &sides, reference, &columns, &settings.interval);
+    }
+    if settings.trivial_baselines {
+        // The baselines see only the truth, so any entrant's will do.
+        for (name, set) in &first.seeds[0].baselines {
+            let side = Side {
+                sets: vec![On::of(&first.seeds[0], set, &common)],
+            };
+            let row = Row {
+                label: name.clone(),
+                kind: RowKind::Baseline,
+                cells: columns
+                    .iter()
+                    .map(|column| side.cell(column, &settings.interval))
+                    .collect(),
+            };
+            if row.cells.iter().any(|cell| cell.value.is_some()) {
+                rows.push(row);
+            }
+        }
+    }
+    rows.extend(published.map(|p| p.rows(&columns)).unwrap_or_default());
+    let mut table = Table {
+        title: title.to_owned(),
+        columns,
+        rows,
+        notes: notes(entrants, settings, &common, published),
+    };
+    table.mark_best();
+    Ok(table)
+}
+
+fn columns(entrants: &[Entrant], wanted: &[String]) -> Result<Vec<Column>, CompareError> {
+    let mut all: Vec<Column> = Vec::new();
+    for set in entrants.iter().flat_map(|e| &e.seeds).map(|s| &s.own) {
+        for column in set
+            .columns
+            .iter()
+            .map(|c| &c.column)
+            .chain(set.sets.iter().map(|s| &s.column))
+        {
+            if !all.contains(column) {
+                all.push(column.clone());
+            }
+        }
+    }
+    if wanted.is_empty() {
+        return Ok(all);
+    }
+    let mut chosen: Vec<Column> = Vec::new();
+    for name in wanted {
+        let found: Vec<&Column> = all.iter().filter(|c| c.answers_to(name)).collect();
+        if found.is_empty() {
+            return Err(CompareError::UnknownColumn {
+                name: name.clone(),
+                known: all.iter().map(|c| c.name.clone()).collect(),
+            });
+        }
+        for column in found {
+            if !chosen.contains(column) {
+                chosen.push(column.clone());
+            }
+        }
+    }
+    Ok(chosen)
+}
+
+/// Clips that every scores file has, in the order of the first.
+fn common_clips(first: &Entrant, entrants: &[Entrant]) -> Result<Vec<String>, CompareError> {
+    let mut common = first.seeds[0].clips.clone();
+    for entrant in entrants {
+        for scores in &entrant.seeds {
+            let present: BTreeSet<&String> = scores.clips.iter().collect();
+            common.retain(|clip| present.contains(clip));
+            if common.is_empty() {
+                return Err(CompareError::NoCommonClips {
+                    first: first.label.clone(),
+                    other: entrant.label.clone(),
+                });
+            }
+        }
+    }
+    Ok(common)
+}
+
+/// A score set seen on the common clips.
+struct On<'a> {
+    set: &'a ScoreSet,
+    /// Position of every common clip in the set.
+    order: Vec<usize>,
+}
+
+impl<'a> On<'a> {
+    fn of(scores: &Scores, set: &'a ScoreSet, common: &[String]) -> Self {
+        let position: BTreeMap<&String, usize> = scores
+            .clips
+            .iter()
+            .enumerate()
+            .map(|(i, c)| (c, i))
+            .collect();
+        Self {
+            set,
+            order: common.iter().map(|clip| position[clip]).collect(),
+        }
+    }
+
+    fn values(&self, column: &str) -> Option<Vec<Outcome>> {
+        let values = &self.set.column(column)?.values;
+        Some(self.order.iter().map(|&i| values[i]).collect())
+    }
+}
+
+/// One row's score sets, one per seed.
+struct Side<'a> {
+    sets: Vec<On<'a>>,
+}
+
+impl Side<'_> {
+    fn cell(&self, column: &Column, settings: &IntervalSettings) -> Cell {
+        if column.is_per_set() {
+            return self.set_cell(column, settings);
+        }
+        let per_seed: Vec<Vec<Outcome>> = self
+            .sets
+            .iter()
+            .filter_map(|s| s.values(&column.name))
+            .collect();
+        if per_seed.is_empty() {
+            return Cell::default();
+        }
+        let summaries: Vec<Summary> = per_seed.iter().map(|values| summarise(values)).collect();
+        let seed_means: Vec<f64> = summaries.iter().filter_map(|s| s.mean).collect();
+        let least = summaries.iter().map(|s| s.n).min().unwrap_or(0);
+        let per_clip: Vec<f64> = clip_means(&per_seed).into_iter().flatten().collect();
+        let over = |what| settings.over.contains(&what);
+        let seeds = over(Over::Seeds)
+            .then(|| student_interval(&seed_means, settings.level))
+            .flatten();
+        let clips = over(Over::Clips)
+            .then(|| bootstrap_mean(&per_clip, settings.level, settings.resamples, settings.seed))
+            .flatten();
+        Cell {
+            value: mean(seed_means.iter().copied()),
+            interval: wider(seeds, clips),
+            n: least,
+            seeds: per_seed.len(),
+            n_null: summaries.iter().map(|s| s.n_null).max().unwrap_or(0),
+            n_degenerate: summaries.iter().map(|s| s.n_degenerate).max().unwrap_or(0),
+            ..Cell::default()
+        }
+    }
+
+    /// Set-wide numbers belong to the set they were computed on; only seeds can vary.
+    fn set_cell(&self, column: &Column, settings: &IntervalSettings) -> Cell {
+        let scores: Vec<_> = self
+            .sets
+            .iter()
+            .filter_map(|s| s.set.set(&column.name))
+            .collect();
+        let values: Vec<f64> = scores.iter().filter_map(|s| s.value).collect();
+        let interval = settings
+            .over
+            .contains(&Over::Seeds)
+            .then(|| student_interval(&values, settings.level))
+            .flatten();
+        Cell {
+            value: mean(values.iter().copied()),
+            interval,
+            n: scores.iter().map(|s| s.n).min().unwrap_or(0),
+            seeds: scores.len(),
+            floor: scores.first().and_then(|s| s.floor),
+            in_brackets: scores.iter().any(|s| s.in_brackets()),
+            reason: scores.iter().find_map(|s| s.unavailable.clone()),
+            ..Cell::default()
+        }
+    }
+}
+
+/// Every clip's mean over the seeds that have a number; `None` where no seed has one.
+fn clip_means(per_seed: &[Vec<Outcome>]) -> Vec<Option<f64>> {
+    let clips = per_seed.first().map_or(0, Vec::len);
+    (0..clips)
+        .map(|i| mean(per_seed.iter().filter_map(|values| values[i].number())))
+        .collect()
+}
+
+fn wider(a: Option<Interval>, b: Option<Interval>) -> Option<Interval> {
+    match (a, b) {
+        (Some(a), Some(b)) => Some(if a.width() >= b.width() { a } else { b }),
+        (a, b) => a.or(b),
+    }
+}
+
+/// Paired differences of every row against row `reference`, Holm-corrected over the rows of each column.
+fn add_differences(
+    rows: &mut [Row],
+    sides: &[Side],
+    reference: usize,
+    columns: &[Column],
+    settings: &IntervalSettings,
+) {
+    for (position, column) in columns.iter().enumerate() {
+        if column.is_per_set() {
+            continue;
+        }
+        let means = |side: &Side| {
+            let per_seed: Vec<_> = side
+                .sets
+                .iter()
+                .filter_map(|s| s.values(&column.name))
+                .collect();
+            clip_means(&per_seed)
+        };
+        let base = means(&sides[reference]);
+        let mut found: Vec<(usize, Difference)> = Vec::new();
+        for (i, side) in sides.iter().enumerate().filter(|(i, _)| *i != reference) {
+            let pairs: Vec<(f64, f64)> = means(side)
+                .iter()
+                .zip(&base)
+                .filter_map(|(a, b)| Some(((*a)?, (*b)?)))
+                .collect();
+            found.extend(
+                paired_difference(&pairs, settings.level, settings.resamples, settings.seed)
+                    .map(|d| (i, d)),
+            );
+        }
+        let p: Vec<f64> = found.iter().filter_map(|(_, d)| d.p).collect();
+        let mut corrected = holm(&p).into_iter();
+        for (i, mut difference) in found {
+            if difference.p.is_some() {
+                difference.p_holm = corrected.next();
+            }
+            rows[i].cells[position].difference = Some(difference);
+        }
+    }
+}
+
+fn notes(
+    entrants: &[Entrant],
+    settings: &CompareSettings,
+    common: &[String],
+    published: Option<&Published>,
+) -> Vec<String> {
+    let percent = 100.0 * settings.interval.level;
+    let mut notes = vec![format!(
+        "{} common clips; [{percent:.0} % interval]: bootstrap over clips, Student's t over seeds, the wider of the two",
+        common.len()
+    )];
+    if let Some(baseline) = &settings.baseline {
+        notes.push(format!(
+            "differences to `{baseline}`: paired bootstrap on common clips, p after Holm over the rows of a column"
+        ));
+    }
+    let mut seen = BTreeSet::new();
+    for entrant in entrants {
+        for scores in &entrant.seeds {
+            if let Some(sample) = &scores.sample {
+                seen.insert(format!(
+                    "{}: {} clips drawn by SHA-256 with seed {}",
+                    scores.suite, sample.clips, sample.seed
+                ));
+            }
+            for (reason, count) in &scores.left_out {
+                seen.insert(format!("{}: {reason} on {count} clips", entrant.label));
+            }
+            for note in &scores.notes {
+                seen.insert(format!("{}: {note}", entrant.label));
+            }
+        }
+    }
+    notes.extend(seen);
+    notes.extend(published.map(Published::note));
+    notes
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::evaluation::scores::{ColumnScores, FORMAT};
+    use rand::RngExt;
+
+    fn scores(seed: u64, clips: std::ops::Range<usize>, shift: f64) -> Scores {
+        let values = clips
+            .clone()
+            .map(|i| {
+                let mut clip = crate::random::stream(0, "compare.clip", i as u64, 0);
+                let mut noise = crate::random::stream(seed, "compare.noise", i as u64, 0);
+                Outcome::Number(100.0 * clip.random::<f64>() + shift + noise.random::<f64>())
+            })
+            .collect();
+        Scores {
+            format: FORMAT,
+            suite: "test".into(),
+            system: "reviv".into(),
+            clips: clips.map(|i| format!("clip/{i}")).collect(),
+            own: ScoreSet {
+                columns: vec![ColumnScores {
+                    column: Column::named("body.ga_mpjpe").unwrap(),
+                    values,
+                }],
+                sets: Vec::new(),
+            },
+            baselines: BTreeMap::new(),
+            left_out: BTreeMap::new(),
+            notes: Vec::new(),
+            sample: None,
+        }
+    }
+
+    #[test]
+    fn a_shift_that_the_intervals_hide_is_found_in_the_paired_difference() {
+        let entrants = [
+            Entrant {
+                label: "full".into(),
+                seeds: vec![scores(1, 0..60, 0.0), scores(2, 0..60, 0.0)],
+            },
+            Entrant {
+                label: "uniform".into(),
+                seeds: vec![scores(3, 10..60, 5.0), scores(4, 10..60, 5.0)],
+            },
+        ];
+        let settings = CompareSettings {
+            baseline: Some("full".into()),
+            ..CompareSettings::default()
+        };
+        let table = compare("test", &entrants, &settings, None).unwrap();
+        let cell = &table.rows[1].cells[0];
+        assert_eq!((cell.n, cell.seeds), (50, 2));
+        let difference = cell.difference.unwrap();
+        assert!(difference.interval.unwrap().contains(5.0) && difference.p_holm.unwrap() < 0.01);
+        assert!(!table.rows[0].cells[0].bold, "the intervals overlap");
+        assert_eq!(table.rows[0].cells[0].n, 50, "only common clips count");
+    }
+
+    #[test]
+    fn what_cannot_be_compared_says_so() {
+        let entrant = |label: &str, clips| Entrant {
+            label: label.into(),
+            seeds: vec![scores(0, clips, 0.0)],
+        };
+        let settings = CompareSettings::default();
+        let apart = [entrant("a", 0..5), entrant("b", 5..9)];
+        assert!(matches!(
+            compare("", &apart, &settings, None),
+            Err(CompareError::NoCommonClips { .. })
+        ));
+        assert_eq!(
+            compare("", &[], &settings, None),
+            Err(CompareError::Nothing)
+        );
+        let unknown = CompareSettings {
+            columns: vec!["gaze.mse".into()],
+            ..settings
+        };
+        assert!(matches!(
+            compare("", &[entrant("a", 0..5)], &unknown, None),
+            Err(CompareError::UnknownColumn { .. })
+        ));
+    }
+
+    #[test]
+    fn one_clip_has_a_value_and_no_interval() {
+        let one = Entrant {
+            label: "a".into(),
+            seeds: vec![scores(0, 0..1, 0.0)],
+        };
+        let table = compare("", &[one], &CompareSettings::default(), None).unwrap();
+        let cell = &table.rows[0].cells[0];
+        assert!(cell.value.is_some() && cell.interval.is_none() && cell.n == 1);
+    }
+}

@@ -1,0 +1,159 @@
+//! The one table: typed rows and cells, before anything is printed.
+
+use super::columns::{Better, Column};
+use super::statistics::{Difference, Interval};
+use serde::{Deserialize, Serialize};
+
+/// A table of systems against columns.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct Table {
+    pub title: String,
+    pub columns: Vec<Column>,
+    pub rows: Vec<Row>,
+    /// What must be read with the numbers; printed below.
+    pub notes: Vec<String>,
+}
+
+/// Who a row is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum RowKind {
+    /// Computed by us on these clips.
+    System,
+    /// A trivial baseline, computed by us on these clips.
+    Baseline,
+    /// A number from a paper, on other clips: context, never compared.
+    Published,
+}
+
+/// One line.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Row {
+    pub label: String,
+    pub kind: RowKind,
+    /// One per column.
+    pub cells: Vec<Cell>,
+}
+
+/// One number with everything that qualifies it.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct Cell {
+    pub value: Option<f64>,
+    pub interval: Option<Interval>,
+    /// Clips that the value is a mean of.
+    pub n: usize,
+    pub seeds: usize,
+    pub n_null: usize,
+    pub n_degenerate: usize,
+    /// Against the table's baseline row, on common clips.
+    pub difference: Option<Difference>,
+    /// The number of the truth's own halves, for set-wide columns.
+    pub floor: Option<f64>,
+    /// Too few clips for the metric to mean much.
+    pub in_brackets: bool,
+    /// The best, and its interval clears the runner-up.
+    pub bold: bool,
+    /// Why there is no value.
+    pub reason: Option<String>,
+}
+
+impl Table {
+    /// Marks, per column, the best system whose interval does not reach the interval (or the value) of the runner-up. Baselines
+    /// compete, published rows do not; without an interval nothing is bold.
+    pub fn mark_best(&mut self) {
+        for position in 0..self.columns.len() {
+            let sign = match self.columns[position].better {
+                Better::Lower => 1.0,
+                Better::Higher => -1.0,
+            };
+            let mut ranked: Vec<(f64, usize)> = self
+                .rows
+                .iter()
+                .enumerate()
+                .filter(|(_, row)| row.kind != RowKind::Published)
+                .filter_map(|(i, row)| Some((sign * row.cells.get(position)?.value?, i)))
+                .collect();
+            ranked.sort_by(|a, b| a.0.total_cmp(&b.0));
+            let &[(_, best), (_, second), ..] = ranked.as_slice() else {
+                continue;
+            };
+            let worst_of_best = self.edge(best, position, sign, 1.0);
+            let best_of_second = self
+                .edge(second, position, sign, -1.0)
+                .or(self.rows[second].cells[position].value.map(|v| sign * v));
+            let clears = matches!((worst_of_best, best_of_second), (Some(a), Some(b)) if a < b);
+            if clears
+                && self.rows[best].kind == RowKind::System
+                && !self.rows[best].cells[position].in_brackets
+            {
+                self.rows[best].cells[position].bold = true;
+            }
+        }
+    }
+
+    /// The end of a cell's interval, in a sense where lower is better: the worse one for `side` 1, the better one for -1.
+    fn edge(&self, row: usize, position: usize, sign: f64, side: f64) -> Option<f64> {
+        let interval = self.rows[row].cells[position].interval?;
+        let (a, b) = (sign * interval.low, sign * interval.high);
+        Some(if side > 0.0 { a.max(b) } else { a.min(b) })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::evaluation::statistics::Over;
+
+    fn table(cells: &[(f64, Option<(f64, f64)>)]) -> Table {
+        let rows = cells
+            .iter()
+            .map(|&(value, interval)| Row {
+                label: value.to_string(),
+                kind: RowKind::System,
+                cells: vec![Cell {
+                    value: Some(value),
+                    interval: interval.map(|(low, high)| Interval {
+                        low,
+                        high,
+                        over: Over::Clips,
+                    }),
+                    ..Cell::default()
+                }],
+            })
+            .collect();
+        Table {
+            columns: vec![Column::named("body.ga_mpjpe").unwrap()],
+            rows,
+            ..Table::default()
+        }
+    }
+
+    fn bold(mut table: Table) -> Vec<bool> {
+        table.mark_best();
+        table.rows.iter().map(|r| r.cells[0].bold).collect()
+    }
+
+    #[test]
+    fn only_a_winner_whose_interval_clears_the_runner_up_is_bold() {
+        assert_eq!(
+            bold(table(&[(1.0, Some((0.9, 1.1))), (2.0, Some((1.5, 2.5)))])),
+            [true, false]
+        );
+        assert_eq!(
+            bold(table(&[(1.0, Some((0.9, 1.6))), (2.0, Some((1.5, 2.5)))])),
+            [false, false]
+        );
+        assert_eq!(
+            bold(table(&[(1.0, None), (2.0, Some((1.5, 2.5)))])),
+            [false, false]
+        );
+        assert_eq!(
+            bold(table(&[(1.0, Some((0.9, 1.1))), (2.0, None)])),
+            [true, false]
+        );
+        assert_eq!(bold(table(&[(1.0, Some((0.9, 1.1)))])), [false]);
+        let mut higher = table(&[(1.0, Some((0.9, 1.1))), (2.0, Some((1.5, 2.5)))]);
+        higher.columns[0].better = Better::Higher;
+        assert_eq!(bold(higher), [false, true]);
+    }
+}

@@ -1,0 +1,624 @@
+//! Predictions on disk: what a system says about a set of clips, ours or anyone's.
+//!
+//! A folder with `predictions.json` and one npz per clip. Arrays of an npz, all optional:
+//!
+//! | array | shape | meaning |
+//! |---|---|---|
+//! | `camera` | `[T, 4, 4]` or `[T, 9]` | camera-to-world, OpenCV axes, metres; 9 = two rotation columns are made orthonormal, third ignored, then translation |
+//! | `gaze` | `[T, 2]` | x right, y down, the square image is `[0, 1]^2` |
+//! | `body` | `[T, 21, 3]` | metres |
+//! | `left_hand`, `right_hand` | `[T, 21, 3]` | metres, camera of the same sample |
+//! | `depth` | `[T, H, W]` | as predicted: depth or inverse depth, see its `unit` |
+//! | `rgb` | `[T, H, W, 3]` u8 | colour |
+//! | `declared.<name>` | `[T, C]` | a modality declared in YAML |
+//! | `<modality>_valid` | the signal without its last axis | false = nothing predicted there |
+//! | `confidence.<modality>` | `[T]` | from the token entropies, 0 to 1 |
+//!
+//! Other systems need no `predictions.json`: a folder of npz files is enough, the path of a file without `.npz` is its clip id,
+//! and rates are the usual ones (video 8 Hz, everything else 30 Hz).
+
+use crate::clip::{CameraTrack, Clip, Depth, GazeTrack, JointTrack, Rgb, Signal};
+use crate::formats::FormatError;
+use crate::formats::npy::{Element, NpyArray};
+use crate::formats::npz::Npz;
+use crate::geometry::{rigid, rotation};
+use nalgebra::{Isometry3, Matrix3, Translation3, Vector3};
+use ndarray::{Array1, Array2, Array3, ArrayD, Dimension, Ix1, Ix2, Ix3, Ix4};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// The index of a folder of predictions.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct PredictionsIndex {
+    /// Version of this layout.
+    pub format: u32,
+    /// Who predicted: `reviv`, `EgoAllo`, ...
+    pub system: String,
+    /// By modality name.
+    pub signals: BTreeMap<String, SignalNote>,
+    pub clips: Vec<PredictedClip>,
+}
+
+/// What must be known of a signal before its numbers mean anything.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct SignalNote {
+    /// `m`, `image`, `1/m`, ...
+    pub unit: String,
+    /// In words: `camera of the same sample`, `first camera of the clip`.
+    pub frame: String,
+    /// Hz.
+    pub rate: f64,
+    pub scale: ScaleStatus,
+}
+
+/// Whether lengths may be read as metres.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ScaleStatus {
+    /// In metres, and why: `learned from metric data`, `floor fit`, `anchor depth`.
+    Metric { by: String },
+    /// Up to an unknown scale (and shift, for depth).
+    Relative,
+    /// Not a length.
+    None,
+}
+
+/// One clip of the index.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct PredictedClip {
+    /// The id of the clip that was predicted.
+    pub id: String,
+    pub source: String,
+    /// Relative to the folder.
+    pub file: String,
+}
+
+/// The index's file name.
+pub const INDEX: &str = "predictions.json";
+/// The current [`PredictionsIndex::format`].
+pub const FORMAT: u32 = 1;
+
+/// Why predictions cannot be read or written.
+#[derive(Debug, thiserror::Error)]
+pub enum PredictionsError {
+    #[error(transparent)]
+    Format(#[from] FormatError),
+    #[error("{path}: {error}")]
+    Io { path: String, error: std::io::Error },
+    #[error("{path}: {reason}")]
+    Content { path: String, reason: String },
+}
+
+impl PredictionsError {
+    fn io(path: &Path) -> impl FnOnce(std::io::Error) -> Self {
+        let path = path.display().to_string();
+        move |error| Self::Io { path, error }
+    }
+
+    fn content(path: &Path, reason: impl Into<String>) -> Self {
+        Self::Content {
+            path: path.display().to_string(),
+            reason: reason.into(),
+        }
+    }
+}
+
+/// Writes predictions clip by clip.
+#[derive(Debug)]
+pub struct PredictionsWriter {
+    directory: PathBuf,
+    index: PredictionsIndex,
+}
+
+impl PredictionsWriter {
+    /// Starts (or continues) a folder. `signals` says what every modality's numbers are.
+    ///
+    /// # Errors
+    /// When the folder cannot be made.
+    pub fn create(
+        directory: &Path,
+        system: &str,
+        signals: BTreeMap<String, SignalNote>,
+    ) -> Result<Self, PredictionsError> {
+        let clips = directory.join("clips");
+        std::fs::create_dir_all(&clips).map_err(PredictionsError::io(&clips))?;
+        Ok(Self {
+            directory: directory.to_owned(),
+            index: PredictionsIndex {
+                format: FORMAT,
+                system: system.to_owned(),
+                signals,
+                clips: Vec::new(),
+            },
+        })
+    }
+
+    /// Writes one clip's predicted signals; `confidence` by modality name, one value per sample.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub fn add(
+        &mut self,
+        clip: &Clip,
+        confidence: &BTreeMap<String, Vec<f32>>,
+    ) -> Result<(), PredictionsError> {
+        let file = format!("clips/{:06}.npz", self.index.clips.len());
+        let mut npz = to_npz(clip);
+        for (modality, values) in confidence {
+            npz = npz.with(
+                &format!("confidence.{modality}"),
+                Array1::from(values.clone()),
+            );
+        }
+        npz.write(&self.directory.join(&file))?;
+        self.index.clips.push(PredictedClip {
+            id: clip.id.clone(),
+            source: clip.source.clone(),
+            file,
+        });
+        Ok(())
+    }
+
+    /// Writes the index.
+    ///
+    /// # Errors
+    /// When it cannot be written.
+    pub fn finish(self) -> Result<PredictionsIndex, PredictionsError> {
+        let path = self.directory.join(INDEX);
+        let text = serde_json::to_string_pretty(&self.index)
+            .map_err(|e| PredictionsError::content(&path, e.to_string()))?;
+        std::fs::write(&path, text).map_err(PredictionsError::io(&path))?;
+        Ok(self.index)
+    }
+}
+
+/// A folder of predictions, read clip by clip.
+#[derive(Debug, Clone)]
+pub struct Predictions {
+    directory: PathBuf,
+    pub index: PredictionsIndex,
+}
+
+impl Predictions {
+    /// Opens a folder with an index, or any folder of npz files.
+    ///
+    /// # Errors
+    /// When the folder cannot be read, the index is of another format or names a file outside the folder, or nothing is there.
+    pub fn open(directory: &Path) -> Result<Self, PredictionsError> {
+        let path = directory.join(INDEX);
+        let index = if path.is_file() {
+            let text = std::fs::read_to_string(&path).map_err(PredictionsError::io(&path))?;
+            let index: PredictionsIndex = serde_json::from_str(&text)
+                .map_err(|e| PredictionsError::content(&path, e.to_string()))?;
+            if index.format != FORMAT {
+                let reason = format!("format {}, this program reads {FORMAT}", index.format);
+                return Err(PredictionsError::content(&path, reason));
+            }
+            let outside = |file: &str| {
+                let file = Path::new(file);
+                file.is_absolute()
+                    || file
+                        .components()
+                        .any(|c| c == std::path::Component::ParentDir)
+            };
+            if let Some(clip) = index.clips.iter().find(|clip| outside(&clip.file)) {
+                let reason = format!("`{}` lies outside the folder", clip.file);
+                return Err(PredictionsError::content(&path, reason));
+            }
+            index
+        } else {
+            PredictionsIndex {
+                format: FORMAT,
+                system: directory.file_name().map_or_else(
+                    || "unnamed".to_owned(),
+                    |name| name.to_string_lossy().into_owned(),
+                ),
+                signals: BTreeMap::new(),
+                clips: npz_files(directory)?,
+            }
+        };
+        if index.clips.is_empty() {
+            let reason = format!("no predictions: neither {INDEX} nor any .npz file");
+            return Err(PredictionsError::content(directory, reason));
+        }
+        Ok(Self {
+            directory: directory.to_owned(),
+            index,
+        })
+    }
+
+    /// The signals of the clip at `position` of the index.
+    ///
+    /// # Errors
+    /// When its file cannot be read, or an array has another shape than the format says.
+    pub fn load(&self, position: usize) -> Result<Clip, PredictionsError> {
+        let entry = self.index.clips.get(position).ok_or_else(|| {
+            PredictionsError::content(&self.directory, format!("no clip {position}"))
+        })?;
+        let path = self.directory.join(&entry.file);
+        let npz = Npz::read(&path)?;
+        let rate = |modality: &str, usual: f64| {
+            self.index
+                .signals
+                .get(modality)
+                .map_or(usual, |note| note.rate)
+        };
+        from_npz(&npz, &entry.id, &entry.source, rate)
+            .map_err(|reason| PredictionsError::content(&path, reason))
+    }
+
+    /// Confidences of the clip at `position`, by modality.
+    ///
+    /// # Errors
+    /// As [`Predictions::load`].
+    pub fn confidence(
+        &self,
+        position: usize,
+    ) -> Result<BTreeMap<String, Vec<f32>>, PredictionsError> {
+        let Some(entry) = self.index.clips.get(position) else {
+            return Ok(BTreeMap::new());
+        };
+        let npz = Npz::read(&self.directory.join(&entry.file))?;
+        npz.arrays
+            .iter()
+            .filter_map(|(name, array)| Some((name.strip_prefix("confidence.")?, array)))
+            .map(|(modality, array)| {
+                Ok((modality.to_owned(), array.to_dim::<f32, Ix1>()?.to_vec()))
+            })
+            .collect()
+    }
+}
+
+/// Every `.npz` below `directory` (two levels of folders at most), in the order of their names.
+fn npz_files(directory: &Path) -> Result<Vec<PredictedClip>, PredictionsError> {
+    fn collect(
+        root: &Path,
+        inside: &str,
+        depth: usize,
+        found: &mut Vec<PredictedClip>,
+    ) -> Result<(), PredictionsError> {
+        let folder = root.join(inside);
+        let mut names = Vec::new();
+        for entry in std::fs::read_dir(&folder).map_err(PredictionsError::io(&folder))? {
+            let entry = entry.map_err(PredictionsError::io(&folder))?;
+            names.push((
+                entry.file_name().to_string_lossy().into_owned(),
+                entry.path().is_dir(),
+            ));
+        }
+        names.sort();
+        for (name, is_folder) in names {
+            let file = if inside.is_empty() {
+                name
+            } else {
+                format!("{inside}/{name}")
+            };
+            if is_folder && depth > 0 {
+                collect(root, &file, depth - 1, found)?;
+            } else if let Some(id) = file.strip_suffix(".npz") {
+                found.push(PredictedClip {
+                    id: id.to_owned(),
+                    source: String::new(),
+                    file: file.clone(),
+                });
+            }
+        }
+        Ok(())
+    }
+    let mut found = Vec::new();
+    collect(directory, "", 2, &mut found)?;
+    Ok(found)
+}
+
+fn to_npz(clip: &Clip) -> Npz {
+    let mut npz = Npz::default();
+    if let Some(camera) = &clip.camera {
+        let rows = camera
+            .T_world_camera
+            .iter()
+            .flat_map(rigid::to_row_major)
+            .collect();
+        let poses = Array3::from_shape_vec((camera.T_world_camera.len(), 4, 4), rows)
+            .expect("16 numbers per pose");
+        npz = npz
+            .with("camera", poses)
+            .with("camera_valid", Array1::from(camera.valid.clone()));
+    }
+    if let Some(gaze) = &clip.gaze {
+        npz = npz
+            .with("gaze", &gaze.points)
+            .with("gaze_valid", &gaze.valid);
+    }
+    for (name, track) in [
+        ("body", &clip.body),
+        ("left_hand", &clip.left_hand),
+        ("right_hand", &clip.right_hand),
+    ] {
+        if let Some(track) = track {
+            npz = npz
+                .with(name, &track.joints)
+                .with(&format!("{name}_valid"), &track.valid);
+        }
+    }
+    if let Some(depth) = &clip.depth {
+        npz = npz.with("depth", &depth.metres);
+    }
+    if let Some(rgb) = &clip.rgb {
+        npz = npz.with("rgb", &rgb.frames);
+    }
+    for (name, signal) in &clip.declared {
+        npz = npz.with(&format!("declared.{name}"), &signal.values);
+        if let Some(valid) = &signal.valid {
+            npz = npz.with(&format!("declared.{name}_valid"), valid);
+        }
+    }
+    npz
+}
+
+/// Names that other systems use for ours.
+const ALIASES: [(&str, &str); 3] = [
+    ("camera", "cam"),
+    ("left_hand", "lhand"),
+    ("right_hand", "rhand"),
+];
+
+fn find<'a>(npz: &'a Npz, name: &str) -> Option<&'a NpyArray> {
+    let alias = ALIASES.iter().find(|(ours, _)| *ours == name);
+    npz.arrays
+        .get(name)
+        .or_else(|| alias.and_then(|(_, theirs)| npz.arrays.get(*theirs)))
+}
+
+fn typed<T: Element, D: Dimension>(
+    name: &str,
+    array: &NpyArray,
+) -> Result<ndarray::Array<T, D>, String> {
+    array.to_dim().map_err(|e| format!("array `{name}`: {e}"))
+}
+
+fn from_npz(
+    npz: &Npz,
+    id: &str,
+    source: &str,
+    rate: impl Fn(&str, f64) -> f64,
+) -> Result<Clip, String> {
+    let mut clip = Clip::empty(id, source);
+    if let Some(array) = find(npz, "camera") {
+        let T_world_camera = camera_poses(array)?;
+        let valid = match npz.arrays.get("camera_valid") {
+            Some(valid) => typed::<bool, Ix1>("camera_valid", valid)?.to_vec(),
+            None => vec![true; T_world_camera.len()],
+        };
+        expect_shape("camera_valid", &[valid.len()], &[T_world_camera.len()])?;
+        clip.camera = Some(CameraTrack {
+            rate: rate("camera", 30.0),
+            T_world_camera,
+            valid,
+            up_world: None,
+            intrinsics: None,
+        });
+    }
+    if let Some(array) = npz.arrays.get("gaze") {
+        let points = typed::<f32, Ix2>("gaze", array)?;
+        expect_shape("gaze", &[points.ncols()], &[2])?;
+        let valid = match npz.arrays.get("gaze_valid") {
+            Some(valid) => typed::<bool, Ix1>("gaze_valid", valid)?,
+            None => Array1::from_elem(points.nrows(), true),
+        };
+        expect_shape("gaze_valid", &[valid.len()], &[points.nrows()])?;
+        clip.gaze = Some(GazeTrack {
+            rate: rate("gaze", 30.0),
+            points,
+            valid,
+        });
+    }
+    for (name, slot) in [
+        ("body", &mut clip.body),
+        ("left_hand", &mut clip.left_hand),
+        ("right_hand", &mut clip.right_hand),
+    ] {
+        if let Some(array) = find(npz, name) {
+            *slot = Some(joints(npz, name, array, rate(name, 30.0))?);
+        }
+    }
+    if let Some(array) = npz.arrays.get("depth") {
+        clip.depth = Some(Depth {
+            rate: rate("depth", 8.0),
+            metres: typed::<f32, Ix3>("depth", array)?,
+        });
+    }
+    if let Some(array) = npz.arrays.get("rgb") {
+        clip.rgb = Some(Rgb {
+            rate: rate("rgb", 8.0),
+            frames: typed::<u8, Ix4>("rgb", array)?,
+        });
+    }
+    for (name, array) in &npz.arrays {
+        let Some(modality) = name
+            .strip_prefix("declared.")
+            .filter(|n| !n.ends_with("_valid"))
+        else {
+            continue;
+        };
+        let values: ArrayD<f32> = array.to().map_err(|e| format!("array `{name}`: {e}"))?;
+        let valid = match npz.arrays.get(&format!("{name}_valid")) {
+            Some(valid) => Some(
+                valid
+                    .to()
+                    .map_err(|e| format!("array `{name}_valid`: {e}"))?,
+            ),
+            None => None,
+        };
+        clip.declared
+            .insert(modality.to_owned(), Signal { values, valid });
+    }
+    Ok(clip)
+}
+
+fn joints(npz: &Npz, name: &str, array: &NpyArray, rate: f64) -> Result<JointTrack, String> {
+    let joints = typed::<f32, Ix3>(name, array)?;
+    let (frames, count, axes) = joints.dim();
+    expect_shape(name, &[axes], &[3])?;
+    let valid_name = format!("{name}_valid");
+    let valid = match npz.arrays.get(&valid_name) {
+        Some(array) if array.shape.len() == 1 => {
+            let frames_valid = typed::<bool, Ix1>(&valid_name, array)?;
+            expect_shape(&valid_name, &[frames_valid.len()], &[frames])?;
+            Array2::from_shape_fn((frames, count), |(t, _)| frames_valid[t])
+        }
+        Some(array) => typed::<bool, Ix2>(&valid_name, array)?,
+        None => Array2::from_elem((frames, count), true),
+    };
+    expect_shape(&valid_name, valid.shape(), &[frames, count])?;
+    Ok(JointTrack {
+        rate,
+        joints,
+        valid,
+    })
+}
+
+fn expect_shape(name: &str, found: &[usize], expected: &[usize]) -> Result<(), String> {
+    if found == expected {
+        Ok(())
+    } else {
+        Err(format!(
+            "array `{name}`: {found:?} where {expected:?} is needed"
+        ))
+    }
+}
+
+/// Poses out of `[T, 4, 4]` matrices (a block that is no rotation is refused) or `[T, 9]` vectors (made orthonormal).
+fn camera_poses(array: &NpyArray) -> Result<Vec<Isometry3<f64>>, String> {
+    let name = "camera";
+    if array.shape.len() == 2 {
+        let rows = typed::<f64, Ix2>(name, array)?;
+        expect_shape(name, &[rows.ncols()], &[9])?;
+        return rows
+            .outer_iter()
+            .enumerate()
+            .map(|(i, row)| {
+                let six = [row[0], row[1], row[2], row[3], row[4], row[5]];
+                let turn = rotation::from_6d(&six).ok_or_else(|| {
+                    format!("array `{name}`: the rotation of pose {i} has no direction")
+                })?;
+                let place = Translation3::from(Vector3::new(row[6], row[7], row[8]));
+                Ok(Isometry3::from_parts(place, turn))
+            })
+            .collect();
+    }
+    let matrices = typed::<f64, Ix3>(name, array)?;
+    expect_shape(name, &[matrices.dim().1, matrices.dim().2], &[4, 4])?;
+    matrices
+        .outer_iter()
+        .enumerate()
+        .map(|(i, matrix)| {
+            let mut flat = [0.0; 16];
+            flat.iter_mut()
+                .zip(matrix)
+                .for_each(|(slot, &value)| *slot = value);
+            let turn = Matrix3::from_fn(|r, c| flat[4 * r + c]);
+            if (turn.transpose() * turn - Matrix3::identity()).amax() > 1e-4 {
+                return Err(format!(
+                    "array `{name}`: pose {i}: its rotation part is not a rotation (1e-4)"
+                ));
+            }
+            rigid::from_row_major(&flat).map_err(|e| format!("array `{name}`: pose {i}: {e}"))
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn clip() -> Clip {
+        let mut clip = Clip::empty("world/a/000001", "world");
+        let turn = nalgebra::UnitQuaternion::from_euler_angles(0.1, 0.2, 0.3);
+        clip.camera = Some(CameraTrack {
+            rate: 30.0,
+            T_world_camera: vec![Isometry3::from_parts(Translation3::new(1.0, 2.0, 3.0), turn); 4],
+            valid: vec![true, false, true, true],
+            up_world: None,
+            intrinsics: None,
+        });
+        clip.gaze = Some(GazeTrack {
+            rate: 30.0,
+            points: Array2::from_elem((4, 2), 0.25),
+            valid: Array1::from_elem(4, true),
+        });
+        clip.body = Some(JointTrack {
+            rate: 30.0,
+            joints: Array3::from_elem((4, 21, 3), 0.5),
+            valid: Array2::from_elem((4, 21), true),
+        });
+        clip.declared.insert(
+            "head_imu".to_owned(),
+            Signal {
+                values: ArrayD::zeros(vec![4, 6]),
+                valid: None,
+            },
+        );
+        clip
+    }
+
+    #[test]
+    fn a_clip_survives_the_disk() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut writer =
+            PredictionsWriter::create(folder.path(), "reviv", BTreeMap::new()).unwrap();
+        let confidence = BTreeMap::from([("gaze".to_owned(), vec![0.5_f32; 4])]);
+        writer.add(&clip(), &confidence).unwrap();
+        writer.finish().unwrap();
+        let predictions = Predictions::open(folder.path()).unwrap();
+        let back = predictions.load(0).unwrap();
+        let (a, b) = (clip().camera.unwrap(), back.camera.clone().unwrap());
+        assert!(
+            (a.T_world_camera[0].to_homogeneous() - b.T_world_camera[0].to_homogeneous()).amax()
+                < 1e-12
+        );
+        assert_eq!(a.valid, b.valid);
+        assert_eq!(
+            (back.id.as_str(), &back.gaze, &back.body),
+            ("world/a/000001", &clip().gaze, &clip().body)
+        );
+        assert_eq!(back.declared, clip().declared);
+        assert_eq!(predictions.confidence(0).unwrap(), confidence);
+    }
+
+    #[test]
+    fn a_folder_of_arrays_is_enough_and_nonsense_is_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("egom2p/a.npz");
+        std::fs::create_dir(folder.path().join("egom2p")).unwrap();
+        let nine = Array2::from_shape_fn(
+            (60, 9),
+            |(_, c)| if c == 0 || c == 4 { 0.7_f32 } else { 0.01 },
+        );
+        Npz::default().with("cam", nine).write(&file).unwrap();
+        let predictions = Predictions::open(folder.path()).unwrap();
+        assert_eq!(predictions.index.clips[0].id, "egom2p/a");
+        assert_eq!(
+            predictions
+                .load(0)
+                .unwrap()
+                .camera
+                .unwrap()
+                .T_world_camera
+                .len(),
+            60
+        );
+        for bad in [
+            Npz::default().with("camera", Array3::<f64>::zeros((3, 4, 4))),
+            Npz::default().with("gaze", Array2::<f32>::zeros((3, 3))),
+            Npz::default()
+                .with("body", Array3::<f32>::zeros((3, 21, 3)))
+                .with("body_valid", Array1::from_elem(2, true)),
+        ] {
+            bad.write(&file).unwrap();
+            let error = predictions.load(0).unwrap_err().to_string();
+            assert!(error.contains("array `"), "{error}");
+        }
+        assert!(Predictions::open(&folder.path().join("nothing")).is_err());
+    }
+}
