@@ -1,7 +1,7 @@
 //! From proportions to token counts (Supp. B; Alg. 1, lines 3 to 6).
 
 use super::Overflow;
-use super::dirichlet::{largest_share, proportions};
+use super::dirichlet::{JUST_BELOW_ONE, largest_share, proportions};
 use crate::random::StreamRng;
 
 /// `floor(share * total)` per modality, in f32 as the reference computes it, then the rest one token at a time to the
@@ -33,51 +33,87 @@ pub fn clamp(budgets: &mut [usize], room: &[usize]) -> usize {
     excess
 }
 
-/// Budgets for one side of a sample: Dirichlet proportions (or `shares`, if given) of `total` within `room`.
-pub fn draw(
-    alphas: &[f64],
-    total: usize,
-    room: &[usize],
-    overflow: Overflow,
-    shares: Option<&[f32]>,
-    rng: &mut StreamRng,
-) -> Vec<usize> {
-    let own;
-    let shares = if let Some(shares) = shares {
-        shares
-    } else {
-        own = proportions(alphas, rng);
-        &own
-    };
-    if shares.iter().all(|share| *share == 0.0) {
-        return vec![0; room.len()];
-    }
-    let mut budgets = allocate(shares, total, || largest_share(alphas, rng));
-    let mut excess = clamp(&mut budgets, room);
-    while overflow == Overflow::Respill && excess > 0 {
-        let left: Vec<usize> = room.iter().zip(&budgets).map(|(r, b)| r - b).collect();
-        let alphas: Vec<f64> = alphas
-            .iter()
-            .zip(&left)
-            .map(|(alpha, left)| if *left > 0 { *alpha } else { 0.0 })
-            .collect();
-        if alphas.iter().all(|alpha| *alpha == 0.0) {
-            break;
+/// One side of a sample's budget.
+#[derive(Debug, Clone, Copy)]
+pub struct Side<'a> {
+    /// Concentrations; 0 means never.
+    pub alphas: &'a [f64],
+    /// Tokens to spend.
+    pub total: usize,
+    /// Tokens each modality can take.
+    pub room: &'a [usize],
+    /// What becomes of the rest.
+    pub overflow: Overflow,
+    /// Whether one share may be the whole; see [`super::MaskingSettings::whole_budget`].
+    pub whole_budget: bool,
+}
+
+impl Side<'_> {
+    /// Budgets from Dirichlet proportions, or from `shares` where given.
+    pub fn draw(&self, shares: Option<&[f32]>, rng: &mut StreamRng) -> Vec<usize> {
+        let mut shares = shares.map_or_else(|| proportions(self.alphas, rng), <[f32]>::to_vec);
+        if shares.iter().all(|share| *share == 0.0) {
+            return vec![0; self.room.len()];
         }
-        let shares = proportions(&alphas, rng);
-        let mut more = allocate(&shares, excess, || largest_share(&alphas, rng));
-        excess = clamp(&mut more, &left);
-        for (budget, more) in budgets.iter_mut().zip(more) {
-            *budget += more;
+        if !self.whole_budget {
+            for share in &mut shares {
+                *share = share.min(JUST_BELOW_ONE);
+            }
+        }
+        let mut budgets = allocate(&shares, self.total, || largest_share(self.alphas, rng));
+        let excess = clamp(&mut budgets, self.room);
+        if self.overflow == Overflow::Respill {
+            self.respill(&mut budgets, excess, rng);
+        }
+        budgets
+    }
+
+    fn respill(&self, budgets: &mut [usize], mut excess: usize, rng: &mut StreamRng) {
+        while excess > 0 {
+            let left: Vec<usize> = self
+                .room
+                .iter()
+                .zip(&*budgets)
+                .map(|(r, b)| r - b)
+                .collect();
+            let alphas: Vec<f64> = self
+                .alphas
+                .iter()
+                .zip(&left)
+                .map(|(alpha, left)| if *left > 0 { *alpha } else { 0.0 })
+                .collect();
+            if alphas.iter().all(|alpha| *alpha == 0.0) {
+                break;
+            }
+            let shares = proportions(&alphas, rng);
+            let mut more = allocate(&shares, excess, || largest_share(&alphas, rng));
+            excess = clamp(&mut more, &left);
+            for (budget, more) in budgets.iter_mut().zip(more) {
+                *budget += more;
+            }
         }
     }
-    budgets
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::random::stream;
+
+    fn side<'a>(
+        alphas: &'a [f64],
+        total: usize,
+        room: &'a [usize],
+        overflow: Overflow,
+    ) -> Side<'a> {
+        Side {
+            alphas,
+            total,
+            room,
+            overflow,
+            whole_budget: false,
+        }
+    }
 
     #[test]
     fn whole_budget_is_spent_before_clamping() {
@@ -93,7 +129,7 @@ mod tests {
             let alphas = [0.1, 0.1, 0.1];
             let sum = |overflow| {
                 let mut rng = stream(0, "test.overflow", 0, sample);
-                let budgets = draw(&alphas, 2048, &room, overflow, None, &mut rng);
+                let budgets = side(&alphas, 2048, &room, overflow).draw(None, &mut rng);
                 assert!(budgets.iter().zip(room).all(|(b, r)| *b <= r));
                 budgets.iter().sum::<usize>()
             };
@@ -101,14 +137,7 @@ mod tests {
             assert_eq!(sum(Overflow::Respill), 2048);
         }
         let mut rng = stream(0, "test.overflow", 1, 0);
-        let all = draw(
-            &[1.0, 1.0],
-            900,
-            &[30, 210],
-            Overflow::Respill,
-            None,
-            &mut rng,
-        );
+        let all = side(&[1.0, 1.0], 900, &[30, 210], Overflow::Respill).draw(None, &mut rng);
         assert_eq!(all, [30, 210], "stops when nothing has room");
     }
 
@@ -116,14 +145,9 @@ mod tests {
     fn nothing_is_given_to_concentration_zero() {
         for sample in 0..200 {
             let mut rng = stream(0, "test.never", 0, sample);
-            let budgets = draw(
-                &[0.0, 1.0, 0.0],
-                777,
-                &[5120, 210, 30],
-                Overflow::Respill,
-                None,
-                &mut rng,
-            );
+            let room = [5120, 210, 30];
+            let budgets =
+                side(&[0.0, 1.0, 0.0], 777, &room, Overflow::Respill).draw(None, &mut rng);
             assert_eq!(budgets, [0, 210, 0]);
         }
     }

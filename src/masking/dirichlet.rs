@@ -25,6 +25,9 @@ pub fn log_gamma_draws(alphas: &[f64], rng: &mut StreamRng) -> Vec<f64> {
         .collect()
 }
 
+/// The largest `f32` below one: where the reference's sampler clamps a share.
+pub const JUST_BELOW_ONE: f32 = 1.0 - f32::EPSILON / 2.0;
+
 /// One draw of Dirichlet(`alphas`): non-negative, sum 1; all zero when every alpha is 0.
 pub fn proportions(alphas: &[f64], rng: &mut StreamRng) -> Vec<f32> {
     let logs = log_gamma_draws(alphas, rng);

@@ -109,14 +109,14 @@ impl Masking {
         let shared = settings
             .shared_proportions
             .then(|| super::dirichlet::proportions(&input_alphas, rng));
-        let input = budget::draw(
-            &input_alphas,
-            inputs,
-            &tokens,
-            settings.overflow,
-            shared.as_deref(),
-            rng,
-        );
+        let side = |alphas, total, room| budget::Side {
+            alphas,
+            total,
+            room,
+            overflow: settings.overflow,
+            whole_budget: settings.whole_budget,
+        };
+        let input = side(&input_alphas, inputs, &tokens).draw(shared.as_deref(), rng);
         let room: Vec<usize> = tokens.iter().zip(&input).map(|(n, b)| n - b).collect();
         let target = if let Some(mut shares) = shared {
             // What the input gave to a modality that is never asked for is not passed on (Alg. 1 to the letter).
@@ -126,16 +126,9 @@ impl Masking {
             let kept: f32 = shares.iter().sum();
             let total = (kept * targets as f32).round() as usize;
             let shares: Vec<f32> = shares.iter().map(|s| s / kept.max(1e-30)).collect();
-            budget::draw(
-                &target_alphas,
-                total,
-                &room,
-                settings.overflow,
-                Some(&shares),
-                rng,
-            )
+            side(&target_alphas, total, &room).draw(Some(&shares), rng)
         } else {
-            budget::draw(&target_alphas, targets, &room, settings.overflow, None, rng)
+            side(&target_alphas, targets, &room).draw(None, rng)
         };
         Budgets {
             component,
@@ -335,6 +328,7 @@ mod tests {
     fn one_to_one_gives_one_modality_and_asks_for_one() {
         let settings = MaskingSettings {
             alpha: Alphas::One(0.001),
+            whole_budget: true,
             ..Default::default()
         };
         let used = |side: &[Vec<u32>]| side.iter().filter(|p| !p.is_empty()).count();

@@ -31,6 +31,9 @@ pub struct MaskingSettings {
     pub overflow: Overflow,
     /// Use the input's proportions for the targets too (the letter of the paper's Alg. 1) instead of an independent draw.
     pub shared_proportions: bool,
+    /// Let one modality take the whole budget. Off, shares stay just below one, where the reference's sampler clamps them: a
+    /// draw that favours one modality alone then leaves one token over, which goes to the winner of a fresh draw.
+    pub whole_budget: bool,
 }
 
 impl Default for MaskingSettings {
@@ -47,6 +50,7 @@ impl Default for MaskingSettings {
             target_tokens: TokenBudget::Fixed(2048),
             overflow: Overflow::Drop,
             shared_proportions: false,
+            whole_budget: false,
         }
     }
 }

@@ -342,7 +342,7 @@ mod tests {
     fn spec() -> MgetSpec {
         MgetSpec {
             size: Size::default(),
-            positions: Positions::Release,
+            positions: Positions::Released,
             modalities: vec![
                 ModalitySpec::tokens("camera", &[4], 10),
                 ModalitySpec::pixels("pixels", [2, 4, 4, 1], [1, 2, 2]),

@@ -390,7 +390,7 @@ mod tests {
                 decoder_depth: size.2,
                 hidden: 0,
             },
-            positions: Positions::Release,
+            positions: Positions::Released,
             modalities,
         }
     }

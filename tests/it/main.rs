@@ -1,4 +1,5 @@
 //! One integration test binary, a file per command or promise.
+#![allow(clippy::unwrap_used)] // a test that panics is a test that fails
 
 mod metrics;
 mod parity;

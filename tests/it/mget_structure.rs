@@ -35,7 +35,7 @@ fn modality(release_name: &str, body: usize, gaze: usize) -> ModalitySpec {
 fn spec(size: Size, modalities: &[&str], body: usize, gaze: usize) -> MgetSpec {
     MgetSpec {
         size,
-        positions: Positions::Release,
+        positions: Positions::Released,
         modalities: modalities
             .iter()
             .map(|name| modality(name, body, gaze))
@@ -112,7 +112,7 @@ fn position_tables_are_the_reference_s() {
         ("vq_hand_30x7", vec![30, 7]),
     ] {
         for width in [384, 768] {
-            let own = positions::table(&grid, width, Positions::Release).unwrap();
+            let own = positions::table(&grid, width, Positions::Released).unwrap();
             let name = format!("{kind}.d{width}");
             let rows = file.tensors[&format!("{name}.rows")]
                 .i64("rows")
