@@ -3,7 +3,10 @@
 pub mod report;
 pub mod vectors;
 
+mod mask;
+mod mget;
 mod optim;
+mod structure;
 mod vq;
 
 use std::path::Path;
@@ -17,7 +20,13 @@ pub type Outcome<T = ()> = Result<T, Box<dyn std::error::Error>>;
 type Check = fn(&Path, &mut Report) -> Outcome;
 
 /// The folders that are known, and what compares each.
-const FOLDERS: &[(&str, Check)] = &[("optim", optim::check), ("vq", vq::check)];
+const FOLDERS: &[(&str, Check)] = &[
+    ("mask", mask::check),
+    ("mget", mget::check),
+    ("optim", optim::check),
+    ("structure", structure::check),
+    ("vq", vq::check),
+];
 
 /// Compares everything below `folder`: one known folder, or a set of them.
 pub fn check(folder: &Path) -> Outcome<Report> {

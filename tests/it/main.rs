@@ -1,5 +1,4 @@
 //! One integration test binary, a file per command or promise.
-#![allow(clippy::unwrap_used)] // a test that panics is a test that fails
 
 mod metrics;
 mod parity;
