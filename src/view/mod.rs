@@ -1,1 +1,13 @@
-//! The self-contained page that shows a reconstruction.
+//! The self-contained page that shows a reconstruction: one HTML file, no network, no server.
+//!
+//! Read [`scene`] (what can be shown), then [`page`] (how it becomes one file). The page itself is `page/`: `page.html` with
+//! `page.css`, and a script in three parts, `data.js` (manifest and blobs), `draw.js` (WebGL2), `main.js` (layers, cameras,
+//! timeline, keyboard). `#t=1.5` in the address opens at a time, `#camera=first` with a camera, and `#selftest` makes the page
+//! examine itself and write what it saw into the document.
+
+pub mod cloud;
+pub mod page;
+pub mod scene;
+
+pub use page::write_page;
+pub use scene::{Badge, Confidence, DepthGrids, Fact, Scene, Track, VideoFrames, ViewError};

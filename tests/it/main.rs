@@ -1,4 +1,5 @@
 //! One integration test binary, a file per command or promise.
+#![allow(clippy::unwrap_used)] // A test that cannot go on should stop where it is.
 
 mod metrics;
 mod parity;
@@ -8,3 +9,4 @@ mod trajectories;
 mod language;
 mod language_ops;
 mod vq_structure;
+mod view;

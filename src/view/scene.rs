@@ -1,0 +1,224 @@
+//! What the page can show. All positions are metres in one world with z up.
+
+use crate::clip::Intrinsics;
+use crate::reconstruction::export::ply::Point;
+use nalgebra::Isometry3;
+use ndarray::{Array2, Array3, ArrayView3};
+
+/// Everything on one timeline.
+#[derive(Debug, Clone)]
+pub struct Scene {
+    pub title: String,
+    /// Short statements beside the title: scale status, synthetic or real.
+    pub badges: Vec<Badge>,
+    /// Label and value pairs: unit, frame, rates, what was assumed.
+    pub facts: Vec<Fact>,
+    /// Motion samples per second.
+    pub rate: f64,
+    /// Motion samples on the timeline.
+    pub samples: usize,
+    /// The camera's projection, in pixels of the video.
+    pub intrinsics: Intrinsics,
+    pub video: Option<VideoFrames>,
+    pub depth: Option<DepthGrids>,
+    /// Points of the whole recording, world.
+    pub cloud: Vec<Point>,
+    /// Height of the floor in the world, metres.
+    pub floor: Option<f64>,
+    /// The prediction first; the truth, where it is known, beside it.
+    pub tracks: Vec<Track>,
+    pub confidence: Vec<Confidence>,
+}
+
+/// How a badge is meant; the words say it too.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Tone {
+    Plain,
+    Good,
+    Warn,
+}
+
+/// A short statement beside the title.
+#[derive(Debug, Clone)]
+pub struct Badge {
+    pub text: String,
+    pub tone: Tone,
+}
+
+/// A label and its value.
+#[derive(Debug, Clone)]
+pub struct Fact {
+    pub label: String,
+    pub value: String,
+}
+
+/// The input video, square and upright, as the model saw it. Frames are kept as JPEG, so a long video stays small.
+#[derive(Debug, Clone)]
+pub struct VideoFrames {
+    /// Hz.
+    pub rate: f64,
+    bytes: Vec<u8>,
+    offsets: Vec<usize>,
+}
+
+/// JPEG quality of the embedded video.
+const QUALITY: u8 = 82;
+
+impl VideoFrames {
+    /// A video without frames.
+    pub fn new(rate: f64) -> Self {
+        Self {
+            rate,
+            bytes: Vec::new(),
+            offsets: vec![0],
+        }
+    }
+
+    /// Adds a frame, `[H, W, 3]`.
+    ///
+    /// # Errors
+    /// When the frame has no pixel, not three channels, or a side beyond what JPEG can store.
+    pub fn push(&mut self, frame: ArrayView3<u8>) -> Result<(), ViewError> {
+        let (height, width, channels) = frame.dim();
+        let refuse = |reason: String| ViewError::Jpeg {
+            width,
+            height,
+            reason,
+        };
+        if channels != 3 {
+            return Err(refuse(format!("{channels} channels, expected 3")));
+        }
+        let side = |n: usize| u16::try_from(n).map_err(|e| refuse(e.to_string()));
+        let (w, h) = (side(width)?, side(height)?);
+        let frame = frame.as_standard_layout();
+        let pixels = frame.as_slice().expect("standard layout is contiguous");
+        jpeg_encoder::Encoder::new(&mut self.bytes, QUALITY)
+            .encode(pixels, w, h, jpeg_encoder::ColorType::Rgb)
+            .map_err(|e| refuse(e.to_string()))?;
+        self.offsets.push(self.bytes.len());
+        Ok(())
+    }
+
+    /// Number of frames.
+    pub fn len(&self) -> usize {
+        self.offsets.len() - 1
+    }
+
+    /// Whether there is no frame.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// All frames, one JPEG after the other.
+    pub fn bytes(&self) -> &[u8] {
+        &self.bytes
+    }
+
+    /// Where each frame begins, and where the last one ends.
+    pub fn offsets(&self) -> &[usize] {
+        &self.offsets
+    }
+}
+
+/// Depth of each video frame on a grid over the image.
+#[derive(Debug, Clone)]
+pub struct DepthGrids {
+    /// `[T, h, w]`, metres of z-depth; NaN where unknown. `T` equals the number of video frames.
+    pub metres: Array3<f32>,
+}
+
+/// One version of the wearer.
+#[derive(Debug, Clone)]
+pub struct Track {
+    /// `prediction`, `truth`: letters, digits and `_`.
+    pub name: String,
+    /// Drawn stippled and toggled apart.
+    pub truth: bool,
+    /// `T_world_camera` per sample; `None` where unknown.
+    pub camera: Option<Vec<Option<Isometry3<f64>>>>,
+    /// `[samples, 2]`, image in `[0, 1]^2`; NaN where unknown.
+    pub gaze: Option<Array2<f32>>,
+    /// `[samples, 21, 3]`, world; NaN where unknown.
+    pub body: Option<Array3<f32>>,
+    /// `[samples, 21, 3]`, world; NaN where unknown.
+    pub left_hand: Option<Array3<f32>>,
+    /// `[samples, 21, 3]`, world; NaN where unknown.
+    pub right_hand: Option<Array3<f32>>,
+}
+
+/// A strip under the timeline: 1 is certain, 0 is a guess.
+#[derive(Debug, Clone)]
+pub struct Confidence {
+    /// The modality.
+    pub name: String,
+    /// In `[0, 1]`, evenly spread over the timeline; NaN where unknown.
+    pub values: Vec<f32>,
+}
+
+/// Why a scene cannot be shown.
+#[derive(Debug, thiserror::Error)]
+pub enum ViewError {
+    #[error("{what} has {found} entries, the timeline has {expected}")]
+    Length {
+        what: String,
+        found: usize,
+        expected: usize,
+    },
+    #[error("a scene needs at least one sample and a positive rate")]
+    Empty,
+    #[error("video frames of {width}x{height} cannot be stored as JPEG: {reason}")]
+    Jpeg {
+        width: usize,
+        height: usize,
+        reason: String,
+    },
+    #[error("writing the page: {0}")]
+    Write(#[from] std::io::Error),
+}
+
+impl Scene {
+    /// Refuses lengths that disagree before anything is written.
+    ///
+    /// # Errors
+    /// [`ViewError::Empty`] or [`ViewError::Length`], naming what does not fit.
+    pub fn check(&self) -> Result<(), ViewError> {
+        if self.samples == 0 || self.rate.is_nan() || self.rate <= 0.0 {
+            return Err(ViewError::Empty);
+        }
+        let same = |what: String, found: usize, expected: usize| {
+            if found == expected {
+                Ok(())
+            } else {
+                Err(ViewError::Length {
+                    what,
+                    found,
+                    expected,
+                })
+            }
+        };
+        for track in &self.tracks {
+            let name = &track.name;
+            if let Some(camera) = &track.camera {
+                same(format!("{name} camera"), camera.len(), self.samples)?;
+            }
+            if let Some(gaze) = &track.gaze {
+                same(format!("{name} gaze"), gaze.nrows(), self.samples)?;
+            }
+            let joints = [
+                ("body", &track.body),
+                ("left hand", &track.left_hand),
+                ("right hand", &track.right_hand),
+            ];
+            for (part, values) in joints {
+                if let Some(values) = values {
+                    same(format!("{name} {part}"), values.shape()[0], self.samples)?;
+                    same(format!("{name} {part} joints"), values.shape()[1], 21)?;
+                }
+            }
+        }
+        if let (Some(video), Some(depth)) = (&self.video, &self.depth) {
+            same("depth".into(), depth.metres.shape()[0], video.len())?;
+        }
+        Ok(())
+    }
+}
