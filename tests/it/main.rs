@@ -8,5 +8,5 @@ mod trajectories;
 
 mod language;
 mod language_ops;
-mod vq_structure;
 mod view;
+mod vq_structure;
