@@ -12,6 +12,14 @@ pub struct Holder {
     pub since: String,
 }
 
+/// Why something failed, as the record keeps it.
+#[derive(Debug, Clone, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+pub struct Failure {
+    pub code: String,
+    pub message: String,
+    pub stage: Option<String>,
+}
+
 /// A failure of the record: the run directory, the cache, the locks, a stage.
 #[derive(Debug, thiserror::Error)]
 pub enum RunError {
@@ -43,6 +51,15 @@ pub enum RunError {
     /// Somebody asked to stop, and the stage did.
     #[error("interrupted")]
     Interrupted,
+    /// A stage's own failure, in its op's words.
+    #[error("stage `{stage}`: {message}")]
+    Stage {
+        stage: String,
+        code: String,
+        message: String,
+        help: String,
+        exit: u8,
+    },
     /// The request names something that is not there, or makes no sense.
     #[error("{message}")]
     Request { message: String, help: String },
@@ -74,7 +91,7 @@ impl RunError {
     }
 
     /// The code printed in brackets. `E05` budgets, `E06` inputs missing or changed, `E08` the record.
-    pub fn code(&self) -> &'static str {
+    pub fn code(&self) -> &str {
         match self {
             Self::NoSpace { .. } => "E0502",
             Self::Changed { .. } => "E0602",
@@ -83,6 +100,7 @@ impl RunError {
             Self::Io { .. } => "E0803",
             Self::Malformed { .. } => "E0804",
             Self::Interrupted => "E0805",
+            Self::Stage { code, .. } => code,
             Self::Request { .. } => "E0807",
         }
     }
@@ -113,7 +131,7 @@ impl RunError {
                 "move the file away, or delete the run directory that holds it".into()
             }
             Self::Interrupted => "ask for the same experiment again and it continues".into(),
-            Self::Request { help, .. } => help.clone(),
+            Self::Stage { help, .. } | Self::Request { help, .. } => help.clone(),
         }
     }
 
@@ -127,6 +145,20 @@ impl RunError {
             | Self::Request { .. } => 1,
             Self::NoSpace { .. } | Self::Io { .. } => 2,
             Self::Interrupted => 130,
+            Self::Stage { exit, .. } => *exit,
+        }
+    }
+
+    /// As the record keeps it.
+    pub fn failure(&self) -> Failure {
+        let stage = match self {
+            Self::Stage { stage, .. } => Some(stage.clone()),
+            _ => None,
+        };
+        Failure {
+            code: self.code().into(),
+            message: self.to_string(),
+            stage,
         }
     }
 }

@@ -4,18 +4,27 @@
 //! * [`record`] the run directory and its state; [`cache`] where artifacts live; [`lock`] who may write; [`files`] how anything
 //!   is written; [`error`] what can go wrong
 //! * [`checkpoint`] what a stage keeps to go on from; [`metrics`] and [`tensorboard`] what a stage records; [`progress`] what a person sees meanwhile; [`interrupt`] Ctrl-C
+//! * [`schedule`] what there is to do; [`stage`] one piece of it; [`execute`] all of it
+//! * [`provenance`] where everything came from; [`report`] the run's page
 //! * [`environment`] the only place that looks at machine, git and clock
 
 pub mod cache;
 pub mod checkpoint;
+mod curves;
 pub mod environment;
 pub mod error;
+pub mod execute;
 pub mod files;
 pub mod interrupt;
 pub mod lock;
+mod markdown;
 pub mod metrics;
 pub mod progress;
+pub mod provenance;
 pub mod record;
+pub mod report;
+pub mod schedule;
+pub mod stage;
 pub mod tensorboard;
 
 pub use cache::{Cache, Key, Manifest};

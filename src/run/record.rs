@@ -13,7 +13,7 @@
 
 use super::cache::Key;
 use super::environment;
-use super::error::{AtPath, RunError};
+use super::error::{AtPath, Failure, RunError};
 use super::files;
 use super::interrupt::Interrupt;
 use super::lock::{self, Lock, Mode};
@@ -104,14 +104,6 @@ pub struct Part {
     pub started: String,
     pub ended: Option<String>,
     pub error: Option<Failure>,
-}
-
-/// Why something failed.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Failure {
-    pub code: String,
-    pub message: String,
-    pub stage: Option<String>,
 }
 
 /// A line of `index.jsonl`.

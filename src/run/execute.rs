@@ -1,0 +1,226 @@
+//! Executes an experiment: topological, cached, interruptible, resumable, sharded.
+//!
+//! The same experiment asked for again finds its run by identity and goes on where it stopped. Each piece of work is done
+//! under its key's lock, so that shards and other runs over the same disk wait for it instead of doing it twice.
+
+use super::cache::{Cache, Entry, Key};
+use super::error::RunError;
+use super::interrupt::Interrupt;
+use super::progress::{Progress, duration};
+use super::record::{Owned, RunDirectory, Shard, State};
+use super::schedule::{Schedule, Work};
+use super::stage::{self, Surroundings};
+use super::{provenance, report};
+use crate::experiment::Experiment;
+use crate::experiment::diagnostic::Span;
+use std::collections::BTreeSet;
+use std::path::Path;
+
+/// What to run, and how.
+pub struct Job<'a> {
+    pub experiment: &'a Experiment,
+    /// `file:line` of a span, for `resolved.yaml`.
+    pub cite: &'a dyn Fn(Span) -> String,
+    /// The directory of runs; the cache lies in it.
+    pub runs: &'a Path,
+    /// Only this stage, and what it needs.
+    pub only: Option<&'a str>,
+    pub shard: Shard,
+    pub progress: &'a Progress,
+    pub interrupt: &'a Interrupt,
+}
+
+/// What became of it.
+#[derive(Debug)]
+pub struct Outcome {
+    pub run: RunDirectory,
+    pub state: State,
+    /// Pieces of work done by this process.
+    pub made: usize,
+    /// Pieces of work that were there already.
+    pub found: usize,
+    /// Every stage that failed, in order; what depends on it was left out, everything else was done.
+    pub failures: Vec<RunError>,
+}
+
+/// Where the cache of a directory of runs is.
+pub fn cache_of(runs: &Path) -> Cache {
+    Cache::new(runs.join("cache"))
+}
+
+/// Runs an experiment. An error means that the run could not be begun; what fails later is in the [`Outcome`].
+pub fn execute(job: &Job<'_>) -> Result<Outcome, RunError> {
+    let schedule = Schedule::of(job.experiment)?;
+    let cache = cache_of(job.runs);
+    let targets = schedule.targets(job.only, job.shard)?;
+    let asked = job.experiment.path.display().to_string();
+    let run = RunDirectory::find_or_create(
+        job.runs,
+        &schedule.name,
+        schedule.identity,
+        &asked,
+        job.interrupt,
+    )?;
+
+    if run.read()?.state == State::Done && schedule.to_do(&schedule.results(), &cache).is_empty() {
+        let found = schedule.works.len();
+        return Ok(Outcome {
+            run,
+            state: State::Done,
+            made: 0,
+            found,
+            failures: Vec::new(),
+        });
+    }
+
+    let owned = run.own(job.shard)?;
+    owned.begin()?;
+    let mut worker = Worker {
+        job,
+        schedule: &schedule,
+        cache: &cache,
+        run: &run,
+        made: 0,
+        failures: Vec::new(),
+    };
+    let ended = provenance::write(job, &schedule, &run).and_then(|()| worker.work(&targets));
+    let Worker {
+        made, mut failures, ..
+    } = worker;
+    let state = match ended {
+        Ok(()) if failures.is_empty() => State::Done,
+        Ok(()) => State::Failed,
+        Err(RunError::Interrupted) => State::Interrupted,
+        Err(error) => {
+            failures.push(error);
+            State::Failed
+        }
+    };
+    let state = finish(&owned, &schedule, &cache, state, &mut failures);
+    let found = schedule
+        .works
+        .iter()
+        .filter(|work| cache.contains(&work.key))
+        .count();
+    Ok(Outcome {
+        run,
+        state,
+        made,
+        found: found.saturating_sub(made),
+        failures,
+    })
+}
+
+/// Writes the end of this process's part, and the page.
+fn finish(
+    owned: &Owned,
+    schedule: &Schedule,
+    cache: &Cache,
+    state: State,
+    failures: &mut Vec<RunError>,
+) -> State {
+    let complete = schedule.to_do(&schedule.results(), cache).is_empty();
+    let end = owned.end(state, failures.first().map(RunError::failure), complete);
+    let page = report::write(owned.directory());
+    // With the disk full, say so once; the record is as whole as the disk allows.
+    if let (Err(error), true) = (end.and(page), failures.is_empty()) {
+        failures.push(error);
+    }
+    match state {
+        State::Done if !failures.is_empty() => State::Failed,
+        // This part is done; others of the run may not be.
+        State::Done if !complete => State::Queued,
+        state => state,
+    }
+}
+
+struct Worker<'a> {
+    job: &'a Job<'a>,
+    schedule: &'a Schedule,
+    cache: &'a Cache,
+    run: &'a RunDirectory,
+    made: usize,
+    failures: Vec<RunError>,
+}
+
+impl Worker<'_> {
+    fn work(&mut self, targets: &BTreeSet<Key>) -> Result<(), RunError> {
+        let to_do = self.schedule.to_do(targets, self.cache);
+        self.note_found()?;
+        let mut failed: BTreeSet<Key> = BTreeSet::new();
+        for (index, work) in to_do.iter().enumerate() {
+            if work.input_keys().any(|key| failed.contains(&key)) {
+                failed.insert(work.key);
+                continue;
+            }
+            self.job.interrupt.check()?;
+            let label = work.label(self.schedule.sweep);
+            match self.one(work, &label, index + 1, to_do.len()) {
+                Ok(()) => {}
+                Err(RunError::Interrupted) => return Err(RunError::Interrupted),
+                // Without space nothing else can go well.
+                Err(error @ RunError::NoSpace { .. }) => return Err(error),
+                Err(error) => {
+                    self.job.progress.say(&format!("  failed {label}: {error}"));
+                    failed.insert(work.key);
+                    self.failures.push(error);
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Leaves a note in the directory of every stage that is in the cache already.
+    fn note_found(&self) -> Result<(), RunError> {
+        for work in &self.schedule.works {
+            match self.cache.look(&work.key) {
+                Entry::Whole(_) => stage::note_cached(work, &self.directory(work), self.cache)?,
+                Entry::Damaged(why) => {
+                    let path = self.cache.path(&work.key);
+                    self.job.progress.say(&format!(
+                        "  damaged {}: {why}; it is made again",
+                        path.display()
+                    ));
+                }
+                Entry::Absent => {}
+            }
+        }
+        Ok(())
+    }
+
+    fn one(&mut self, work: &Work, label: &str, index: usize, of: usize) -> Result<(), RunError> {
+        let progress = self.job.progress;
+        let _lock = self.cache.lock(&work.key, self.job.interrupt, |holder| {
+            let who =
+                holder.map_or_else(String::new, |h| format!(" (pid {} on `{}`)", h.pid, h.host));
+            progress.say(&format!(
+                "  waiting for another process{who} that makes {label}"
+            ));
+        })?;
+        let directory = self.directory(work);
+        if self.cache.contains(&work.key) {
+            progress.say(&format!(
+                "  [{index}/{of}] {label}: made by another process"
+            ));
+            return stage::note_cached(work, &directory, self.cache);
+        }
+        progress.say(&format!("  [{index}/{of}] {label}"));
+        let around = Surroundings {
+            cache: self.cache,
+            data: &self.schedule.data,
+            progress,
+            interrupt: self.job.interrupt,
+        };
+        let made = stage::make(work, label, &directory, &around)?;
+        progress.say(&format!(
+            "  [{index}/{of}] {label}: done in {}",
+            duration(made.seconds)
+        ));
+        self.made += 1;
+        Ok(())
+    }
+
+    fn directory(&self, work: &Work) -> std::path::PathBuf {
+        self.run.path().join("stages").join(&work.directory)
+    }
+}

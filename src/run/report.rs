@@ -1,0 +1,343 @@
+//! The page of a run, `report/index.html`: state, stages, times, curves, what the ops have to show, settings, origin. One
+//! file, no network, no script.
+//!
+//! An op joins in by leaving `report/*.md`, `report/*.svg` or `report/*.png` in its artifact: they are shown in the order of
+//! their names under the stage's heading.
+
+use super::cache::Cache;
+use super::curves::{self, Curve};
+use super::environment;
+use super::error::{AtPath, RunError};
+use super::execute::cache_of;
+use super::files;
+use super::markdown::{escape, html};
+use super::metrics;
+use super::progress::duration;
+use super::provenance::LockFile;
+use super::record::{Run, RunDirectory};
+use super::schedule::{Schedule, Work};
+use super::stage::StageRecord;
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+use std::path::Path;
+
+/// Larger pieces are named, not shown.
+const LARGEST_PIECE: u64 = 8 << 20;
+/// More plots than anyone looks at make a page slow.
+const MOST_PLOTS: usize = 60;
+
+/// Writes the page as the run stands now.
+pub fn write(directory: &RunDirectory) -> Result<(), RunError> {
+    let run = directory.read()?;
+    let schedule: Schedule = files::read_json(&directory.path().join("plan.json"))?;
+    let cache = cache_of(directory.runs());
+    let mut page = String::new();
+    head(&mut page, &run, &schedule, directory);
+    stages(&mut page, &schedule, directory);
+    plots(&mut page, &schedule, directory, &cache)?;
+    for work in &schedule.works {
+        sections(&mut page, work, &schedule, &cache)?;
+    }
+    origin(&mut page, directory);
+    page += "</main></body></html>\n";
+    let path = directory.report();
+    files::create_directory(path.parent().unwrap_or(directory.path()))?;
+    files::write(&path, page.as_bytes())
+}
+
+const STYLE: &str = "body{font:15px/1.5 system-ui,sans-serif;margin:0;color:#1a1a1a;background:#fff}\
+main{max-width:64rem;margin:0 auto;padding:1.5rem}h1{margin:.2rem 0}h2{margin-top:2rem;border-bottom:1px solid #ccc}\
+table{border-collapse:collapse;margin:.8rem 0;display:block;overflow-x:auto}th,td{padding:.2rem .7rem;text-align:left;\
+border-bottom:1px solid #e3e3e3;white-space:nowrap}.n{text-align:right;font-variant-numeric:tabular-nums}\
+code,pre{font:13px/1.45 ui-monospace,monospace}pre{background:#f5f5f5;padding:.8rem;overflow-x:auto}\
+.plots{display:flex;flex-wrap:wrap;gap:.5rem}img{max-width:100%}summary{cursor:pointer}\
+@media(prefers-color-scheme:dark){body{background:#161616;color:#e8e8e8}pre{background:#222}th,td{border-color:#333}\
+img{background:#fff}a{color:#8ab4f8}}";
+
+fn head(page: &mut String, run: &Run, schedule: &Schedule, directory: &RunDirectory) {
+    let name = escape(&schedule.name);
+    let _ = write!(
+        page,
+        "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">\
+         <meta name=\"viewport\" content=\"width=device-width,initial-scale=1\"><title>{name}: {}</title>\
+         <style>{STYLE}</style></head>\n<body><main>\n<h1>{name}</h1>\n",
+        run.state
+    );
+    page.push_str(&html(&schedule.about));
+    let mut rows = vec![
+        ("state", run.state.to_string()),
+        ("run", directory.name()),
+        ("experiment", run.experiment.clone()),
+        ("created", run.created.clone()),
+    ];
+    for (shard, part) in &run.parts {
+        let label = if run.parts.len() > 1 {
+            format!("{shard} {}", part.state)
+        } else {
+            part.state.to_string()
+        };
+        let ended = part.ended.clone().unwrap_or_else(|| "still running".into());
+        rows.push((
+            "last work",
+            format!("{label}: {} to {ended} on {}", part.started, part.host),
+        ));
+        if let Some(error) = &part.error {
+            rows.push(("error", format!("{}: {}", error.code, error.message)));
+        }
+    }
+    page.push_str("<table>\n");
+    for (name, value) in rows {
+        let _ = writeln!(page, "<tr><th>{name}</th><td>{}</td></tr>", escape(&value));
+    }
+    page.push_str("</table>\n");
+}
+
+fn stage_directory(directory: &RunDirectory, work: &Work) -> std::path::PathBuf {
+    directory.path().join("stages").join(&work.directory)
+}
+
+fn stages(page: &mut String, schedule: &Schedule, directory: &RunDirectory) {
+    page.push_str("<h2>Stages</h2>\n<table>\n<tr><th>stage</th><th>op</th><th>state</th><th class=\"n\">time</th><th>artifact</th></tr>\n");
+    for work in &schedule.works {
+        let record = StageRecord::read(&stage_directory(directory, work));
+        let state = record
+            .as_ref()
+            .map_or("queued".to_owned(), |record| match &record.found {
+                Some(_) => "done (found in the cache)".to_owned(),
+                None => record.state.to_string(),
+            });
+        let seconds = record.as_ref().map(|record| {
+            record
+                .found
+                .as_ref()
+                .map_or(record.seconds, |made| made.seconds)
+        });
+        let time = seconds
+            .filter(|seconds| *seconds > 0.0)
+            .map_or_else(String::new, duration);
+        let key = work.key.to_string();
+        let _ = writeln!(
+            page,
+            "<tr><td>{}</td><td>{}</td><td>{}</td><td class=\"n\">{time}</td><td><code>cache/{}/{}...</code></td></tr>",
+            escape(&work.label(schedule.sweep)),
+            escape(&work.op),
+            escape(&state),
+            &key[..2],
+            &key[..12],
+        );
+    }
+    page.push_str("</table>\n");
+}
+
+/// One plot per stage name and metric, with a line per cell.
+fn plots(
+    page: &mut String,
+    schedule: &Schedule,
+    directory: &RunDirectory,
+    cache: &Cache,
+) -> Result<(), RunError> {
+    let mut plots: BTreeMap<(usize, String), Vec<Curve>> = BTreeMap::new();
+    let mut order: Vec<&str> = Vec::new();
+    for work in &schedule.works {
+        let position = order
+            .iter()
+            .position(|name| *name == work.stage)
+            .unwrap_or_else(|| {
+                order.push(&work.stage);
+                order.len() - 1
+            });
+        let mut at = stage_directory(directory, work);
+        if !at.join(metrics::METRICS).exists() {
+            // Found in the cache: its curves are where it was made, if that run is still there.
+            if let Some(made) = cache.made(&work.key) {
+                at = directory.runs().join(made.stage);
+            }
+        }
+        let mut curves: BTreeMap<String, Vec<(f64, f64)>> = BTreeMap::new();
+        for row in metrics::read(&at)? {
+            for (name, value) in row.scalars {
+                curves
+                    .entry(name)
+                    .or_default()
+                    .push((row.step as f64, value));
+            }
+        }
+        for (metric, points) in curves {
+            let name = if schedule.sweep {
+                work.cells.join(", ")
+            } else {
+                String::new()
+            };
+            plots
+                .entry((position, metric))
+                .or_default()
+                .push(Curve { name, points });
+        }
+    }
+    if plots.is_empty() {
+        return Ok(());
+    }
+    page.push_str("<h2>Curves</h2>\n<div class=\"plots\">\n");
+    for ((stage, metric), curves) in plots.iter().take(MOST_PLOTS) {
+        if let Some(svg) = curves::svg(&format!("{}: {metric}", order[*stage]), curves) {
+            image(page, "svg+xml", svg.as_bytes(), metric);
+        }
+    }
+    page.push_str("</div>\n");
+    if plots.len() > MOST_PLOTS {
+        let _ = writeln!(
+            page,
+            "<p>{} more are in the stages' <code>metrics.jsonl</code>.</p>",
+            plots.len() - MOST_PLOTS
+        );
+    }
+    Ok(())
+}
+
+/// What an op left to be shown.
+fn sections(
+    page: &mut String,
+    work: &Work,
+    schedule: &Schedule,
+    cache: &Cache,
+) -> Result<(), RunError> {
+    let directory = cache.path(&work.key).join("report");
+    let Ok(entries) = std::fs::read_dir(&directory) else {
+        return Ok(());
+    };
+    let mut names: Vec<_> = entries.flatten().map(|entry| entry.file_name()).collect();
+    names.sort();
+    if !names.is_empty() {
+        let _ = writeln!(page, "<h2>{}</h2>", escape(&work.label(schedule.sweep)));
+    }
+    for name in names {
+        let path = directory.join(&name);
+        let size = std::fs::metadata(&path).at("reading", &path)?.len();
+        let name = name.to_string_lossy();
+        let extension = Path::new(name.as_ref())
+            .extension()
+            .and_then(|e| e.to_str())
+            .unwrap_or("");
+        if size > LARGEST_PIECE {
+            let _ = writeln!(
+                page,
+                "<p><code>{}</code> is too large to show.</p>",
+                escape(&path.display().to_string())
+            );
+            continue;
+        }
+        let bytes = std::fs::read(&path).at("reading", &path)?;
+        match extension {
+            "md" => page.push_str(&html(&String::from_utf8_lossy(&bytes))),
+            "svg" => image(page, "svg+xml", &bytes, &name),
+            "png" => image(page, "png", &bytes, &name),
+            _ => {}
+        }
+    }
+    Ok(())
+}
+
+fn origin(page: &mut String, directory: &RunDirectory) {
+    page.push_str("<h2>Settings and origin</h2>\n");
+    if let Ok(resolved) = std::fs::read_to_string(directory.path().join("resolved.yaml")) {
+        let resolved = escape(&resolved);
+        let _ = writeln!(
+            page,
+            "<details><summary>Every value and where it was written</summary><pre>{resolved}</pre></details>"
+        );
+    }
+    let lock: Result<LockFile, _> = files::read_json(&directory.path().join("lock.json"));
+    let Ok(lock) = lock else {
+        return;
+    };
+    let environment: &environment::Environment = &lock.environment;
+    let git = environment.git.as_ref().map_or_else(
+        || "not in a git work tree".into(),
+        |git| {
+            format!(
+                "{}{}",
+                git.revision,
+                if git.dirty {
+                    ", with changes (source/dirty.patch)"
+                } else {
+                    ""
+                }
+            )
+        },
+    );
+    page.push_str("<table>\n");
+    for (name, value) in [
+        ("reviv", environment.reviv.clone()),
+        ("git", git),
+        (
+            "machine",
+            format!(
+                "{}, {} cores, {}",
+                environment.cpu, environment.cores, environment.system
+            ),
+        ),
+        ("command", environment.argv.join(" ")),
+    ] {
+        let _ = writeln!(page, "<tr><th>{name}</th><td>{}</td></tr>", escape(&value));
+    }
+    for file in &lock.files {
+        let path = escape(&file.path.display().to_string());
+        let _ = writeln!(
+            page,
+            "<tr><th>input</th><td>{path}, {} bytes, <code>{}</code></td></tr>",
+            file.bytes,
+            escape(&file.blake3)
+        );
+    }
+    page.push_str("</table>\n");
+}
+
+/// A picture inside the page; as an `img`, so that nothing in it can act.
+fn image(page: &mut String, kind: &str, bytes: &[u8], name: &str) {
+    let _ = writeln!(
+        page,
+        "<img alt=\"{}\" src=\"data:image/{kind};base64,{}\">",
+        escape(name),
+        base64(bytes)
+    );
+}
+
+fn base64(bytes: &[u8]) -> String {
+    const DIGITS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
+    let mut text = String::with_capacity(bytes.len().div_ceil(3) * 4);
+    for chunk in bytes.chunks(3) {
+        let bits = chunk
+            .iter()
+            .fold(0, |bits, &byte| bits << 8 | u32::from(byte))
+            << (8 * (3 - chunk.len()));
+        for digit in 0..4 {
+            let shown = digit <= chunk.len();
+            let index = (bits >> (18 - 6 * digit)) & 63;
+            text.push(if shown {
+                char::from(DIGITS[index as usize])
+            } else {
+                '='
+            });
+        }
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::base64;
+
+    #[test]
+    fn base64_is_that_of_rfc_4648() {
+        let cases = [
+            ("", ""),
+            ("f", "Zg=="),
+            ("fo", "Zm8="),
+            ("foo", "Zm9v"),
+            ("foobar", "Zm9vYmFy"),
+        ];
+        for (bytes, text) in cases {
+            assert_eq!(base64(bytes.as_bytes()), text);
+        }
+    }
+}

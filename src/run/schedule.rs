@@ -1,0 +1,349 @@
+//! What there is to do: every distinct piece of work of an experiment or a sweep, once, in an order in which inputs come first.
+//!
+//! Arms and seeds that agree on a stage share it, because they agree on its key. `plan.json` is a [`Schedule`]: it is enough
+//! to do any of the work again without the YAML that asked for it.
+
+use super::cache::{Cache, Key};
+use super::error::{AtPath, RunError};
+use super::files;
+use super::record::Shard;
+use crate::experiment::{AnyOp, Experiment, Graph, OpEntry, Stage};
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+
+/// All work of a run.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Schedule {
+    pub name: String,
+    pub about: String,
+    pub identity: Key,
+    pub sweep: bool,
+    pub cells: Vec<CellPlan>,
+    /// Inputs come before what reads them.
+    pub works: Vec<Work>,
+    /// Data sets that are read: name to directory.
+    pub data: BTreeMap<String, PathBuf>,
+}
+
+/// One arm with one seed, and what its stages are.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct CellPlan {
+    pub label: String,
+    pub arm: String,
+    pub seed: u64,
+    /// Stage name to key, in topological order.
+    pub stages: Vec<(String, Key)>,
+    /// The keys of the stages that no other stage reads: what the cell is for.
+    pub results: Vec<Key>,
+}
+
+/// One piece of work.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Work {
+    pub key: Key,
+    /// The stage's name where it appears first.
+    pub stage: String,
+    /// Its directory below the run's `stages/`.
+    pub directory: String,
+    /// Labels of the cells that share it.
+    pub cells: Vec<String>,
+    pub op: String,
+    pub version: u32,
+    /// The artifact's type.
+    pub kind: String,
+    pub seed: u64,
+    pub seeded: bool,
+    pub settings: Value,
+    pub inputs: Vec<PortPlan>,
+    pub files: Vec<FilePlan>,
+    /// Names of the data sets it reads.
+    pub data: Vec<String>,
+    /// Shapes, parameters, memory, FLOP as promised.
+    pub plan: Value,
+}
+
+/// What arrives at one port.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct PortPlan {
+    pub port: String,
+    /// Stage name and key, in the order of the YAML.
+    pub from: Vec<(String, Key)>,
+}
+
+/// An outside file as it was when the run was planned.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct FilePlan {
+    /// The settings key that names it.
+    pub key: String,
+    pub path: PathBuf,
+    pub blake3: String,
+    pub bytes: u64,
+}
+
+impl Schedule {
+    /// Lays out the work of a checked experiment. Reads every outside file once, to hash it.
+    pub fn of(experiment: &Experiment) -> Result<Self, RunError> {
+        let mut hashes = BTreeMap::new();
+        let mut cells = Vec::new();
+        let mut works: Vec<Work> = Vec::new();
+        let mut places: BTreeMap<Key, usize> = BTreeMap::new();
+        for cell in &experiment.cells {
+            let label = cell.label();
+            let keys = keys(&cell.graph, &mut hashes)?;
+            for (stage, &key) in cell.graph.stages.iter().zip(&keys) {
+                if let Some(&at) = places.get(&key) {
+                    if !works[at].cells.contains(&label) {
+                        works[at].cells.push(label.clone());
+                    }
+                    continue;
+                }
+                places.insert(key, works.len());
+                works.push(work(&cell.graph, stage, key, &keys, &label, &hashes));
+            }
+            let read: BTreeSet<usize> = cell
+                .graph
+                .stages
+                .iter()
+                .flat_map(|s| s.edges.iter().flat_map(|e| e.from.iter().copied()))
+                .collect();
+            cells.push(CellPlan {
+                arm: cell.arm.clone(),
+                seed: cell.seed,
+                stages: cell
+                    .graph
+                    .stages
+                    .iter()
+                    .zip(&keys)
+                    .map(|(s, &k)| (s.name.clone(), k))
+                    .collect(),
+                results: keys
+                    .iter()
+                    .enumerate()
+                    .filter(|(i, _)| !read.contains(i))
+                    .map(|(_, &k)| k)
+                    .collect(),
+                label,
+            });
+        }
+        name_directories(&mut works, experiment.sweep);
+        let used: BTreeSet<&String> = works.iter().flat_map(|work| &work.data).collect();
+        let data = experiment
+            .data
+            .iter()
+            .filter(|(name, _)| used.contains(name));
+        let data = data
+            .map(|(name, path)| (name.clone(), path.clone()))
+            .collect();
+        let identity = identity(&experiment.name, &cells);
+        Ok(Self {
+            name: experiment.name.clone(),
+            about: experiment.about.clone(),
+            identity,
+            sweep: experiment.sweep,
+            cells,
+            works,
+            data,
+        })
+    }
+
+    pub fn work(&self, key: &Key) -> Option<&Work> {
+        self.works.iter().find(|work| work.key == *key)
+    }
+
+    /// The keys of what the run is for.
+    pub fn results(&self) -> BTreeSet<Key> {
+        self.cells
+            .iter()
+            .flat_map(|cell| cell.results.iter().copied())
+            .collect()
+    }
+
+    /// What a process aims at: the results of its shard's cells, or the stage it was asked for in them.
+    pub fn targets(&self, only: Option<&str>, shard: Shard) -> Result<BTreeSet<Key>, RunError> {
+        let count = shard.count as usize;
+        let mine = self
+            .cells
+            .iter()
+            .skip(shard.index as usize - 1)
+            .step_by(count.max(1));
+        let Some(only) = only else {
+            return Ok(mine.flat_map(|cell| cell.results.iter().copied()).collect());
+        };
+        let names: BTreeSet<&str> = self
+            .cells
+            .iter()
+            .flat_map(|cell| cell.stages.iter().map(|(name, _)| name.as_str()))
+            .collect();
+        if !names.contains(only) {
+            let names: Vec<String> = names.iter().map(|name| format!("`{name}`")).collect();
+            return Err(RunError::Request {
+                message: format!("no stage `{only}` in `{}`", self.name),
+                help: format!("its stages are {}", names.join(", ")),
+            });
+        }
+        let stages = mine.flat_map(|cell| &cell.stages);
+        Ok(stages
+            .filter(|(name, _)| name == only)
+            .map(|(_, key)| *key)
+            .collect())
+    }
+
+    /// The work that `targets` need and the cache does not have, inputs first.
+    pub fn to_do(&self, targets: &BTreeSet<Key>, cache: &Cache) -> Vec<&Work> {
+        let mut missing: BTreeSet<Key> = BTreeSet::new();
+        let mut needed: BTreeSet<Key> = targets.clone();
+        // Inputs come first in `works`, so that walking backwards meets every reader before what it reads.
+        for work in self.works.iter().rev() {
+            if needed.contains(&work.key) && !cache.contains(&work.key) {
+                missing.insert(work.key);
+                needed.extend(work.input_keys());
+            }
+        }
+        self.works
+            .iter()
+            .filter(|work| missing.contains(&work.key))
+            .collect()
+    }
+}
+
+impl Work {
+    pub fn input_keys(&self) -> impl Iterator<Item = Key> + '_ {
+        self.inputs
+            .iter()
+            .flat_map(|port| port.from.iter().map(|(_, key)| *key))
+    }
+
+    /// A name for people: the stage, and the cell it belongs to if it is one cell's alone.
+    pub fn label(&self, sweep: bool) -> String {
+        match self.cells.as_slice() {
+            [only] if sweep => format!("{} ({only})", self.stage),
+            cells if sweep => format!("{} (shared by {})", self.stage, cells.len()),
+            _ => self.stage.clone(),
+        }
+    }
+
+    /// The op that does it, as linked into this binary.
+    pub fn op(&self) -> Result<&'static dyn AnyOp, RunError> {
+        let mut linked = inventory::iter::<OpEntry>.into_iter();
+        let found = linked.find(|entry| entry.0.name() == self.op);
+        found.map(|entry| entry.0).ok_or_else(|| RunError::Request {
+            message: format!("this binary has no op `{}`", self.op),
+            help: "use the binary that planned the run; plug-in ops live in their own".into(),
+        })
+    }
+}
+
+fn work(
+    graph: &Graph,
+    stage: &Stage,
+    key: Key,
+    keys: &[Key],
+    label: &str,
+    hashes: &Hashes,
+) -> Work {
+    let from = |index: &usize| (graph.stages[*index].name.clone(), keys[*index]);
+    let inputs = stage.edges.iter().map(|edge| PortPlan {
+        port: edge.port.to_owned(),
+        from: edge.from.iter().map(from).collect(),
+    });
+    let files = stage.files.iter().map(|file| {
+        let (blake3, bytes) = hashes.get(&file.path).cloned().unwrap_or_default();
+        FilePlan {
+            key: file.key.clone(),
+            path: file.path.clone(),
+            blake3,
+            bytes,
+        }
+    });
+    Work {
+        key,
+        stage: stage.name.clone(),
+        directory: String::new(),
+        cells: vec![label.to_owned()],
+        op: stage.op.name().to_owned(),
+        version: stage.op.version(),
+        kind: stage.op.output().name().to_owned(),
+        seed: stage.seed,
+        seeded: stage.op.seeded(),
+        settings: stage.settings.clone(),
+        inputs: inputs.collect(),
+        files: files.collect(),
+        data: stage
+            .op
+            .data(&stage.settings)
+            .into_iter()
+            .map(|(name, _)| name)
+            .collect(),
+        plan: serde_json::to_value(graph.plan(stage)).unwrap_or(Value::Null),
+    }
+}
+
+type Hashes = BTreeMap<PathBuf, (String, u64)>;
+
+fn keys(graph: &Graph, hashes: &mut Hashes) -> Result<Vec<Key>, RunError> {
+    let mut failed = None;
+    let mut hash_file = |path: &Path| {
+        if let Some((known, _)) = hashes.get(path) {
+            return blake3::Hash::from_hex(known).map_err(std::io::Error::other);
+        }
+        match files::hash(path) {
+            Ok((hash, bytes)) => {
+                hashes.insert(path.to_path_buf(), (hash.to_hex().to_string(), bytes));
+                Ok(hash)
+            }
+            Err(error) => {
+                failed = Some(error);
+                Err(std::io::Error::other("see the error kept beside"))
+            }
+        }
+    };
+    let keys = graph.keys(&mut hash_file);
+    if let Some(error) = failed {
+        return Err(error);
+    }
+    let keys = keys.at("reading", Path::new("the inputs"))?;
+    Ok(keys.into_iter().map(Key::from).collect())
+}
+
+/// The hash of the name and of every cell's keys: what was asked for, however it was written.
+fn identity(name: &str, cells: &[CellPlan]) -> Key {
+    let mut hasher = blake3::Hasher::new();
+    let mut part = |text: &str| {
+        hasher.update(&(text.len() as u64).to_le_bytes());
+        hasher.update(text.as_bytes());
+    };
+    part("reviv run 1");
+    part(name);
+    for cell in cells {
+        part("cell");
+        part(&cell.label);
+        for (stage, key) in &cell.stages {
+            part(stage);
+            part(&key.to_string());
+        }
+    }
+    hasher.finalize().into()
+}
+
+/// `mget` in an experiment; `full-s0/mget` or `shared/clips` in a sweep, with digits of the key where two want one name.
+fn name_directories(works: &mut [Work], sweep: bool) {
+    let mut taken = BTreeSet::new();
+    for work in works {
+        let stage = work.stage.replace(['/', '\\'], ".");
+        let home = match work.cells.as_slice() {
+            _ if !sweep => stage,
+            [only] => format!("{only}/{stage}"),
+            _ => format!("shared/{stage}"),
+        };
+        let digits = work.key.to_string();
+        let names = std::iter::once(home.clone())
+            .chain((4..=digits.len()).map(|n| format!("{home}-{}", &digits[..n])));
+        work.directory = names
+            .into_iter()
+            .find(|name| !taken.contains(name))
+            .unwrap_or(home);
+        taken.insert(work.directory.clone());
+    }
+}

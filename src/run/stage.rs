@@ -1,0 +1,453 @@
+//! One stage at work: what its op sees of the run, and what stays of it.
+
+use super::cache::{Cache, Entry, Key, Made, Recipe};
+use super::environment;
+use super::error::{AtPath, Failure, RunError};
+use super::files;
+use super::interrupt::Interrupt;
+use super::metrics::Metrics;
+use super::progress::{Progress, Task};
+use super::record::State;
+use super::schedule::Work;
+use super::tensorboard::SessionStatus;
+use crate::experiment::{InputArtifact, StageContext, StageError};
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::Write;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::path::{Path, PathBuf};
+
+/// `stage.json`: where one stage of a run stands.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct StageRecord {
+    pub stage: String,
+    pub op: String,
+    pub key: Key,
+    pub state: State,
+    /// The artifact, relative to the directory of runs.
+    pub artifact: String,
+    /// How often it was begun.
+    pub attempts: u32,
+    /// Of work, over all attempts that could write their end.
+    pub seconds: f64,
+    /// UTC.
+    pub started: Option<String>,
+    pub ended: Option<String>,
+    /// For a stage that was found in the cache: where it was made.
+    pub found: Option<Made>,
+    pub error: Option<Failure>,
+}
+
+impl StageRecord {
+    /// The record in a stage's directory, if there is one.
+    pub fn read(directory: &Path) -> Option<Self> {
+        files::read_json(&directory.join("stage.json")).ok()
+    }
+
+    fn write(&self, directory: &Path) -> Result<(), RunError> {
+        files::write_json(&directory.join("stage.json"), self)
+    }
+
+    fn new(work: &Work, cache: &Cache) -> Self {
+        let runs = cache.root().parent().unwrap_or(Path::new(""));
+        let artifact = cache.path(&work.key);
+        let artifact = artifact.strip_prefix(runs).unwrap_or(&artifact);
+        Self {
+            stage: work.stage.clone(),
+            op: work.op.clone(),
+            key: work.key,
+            state: State::Queued,
+            artifact: artifact.to_string_lossy().into_owned(),
+            attempts: 0,
+            seconds: 0.0,
+            started: None,
+            ended: None,
+            found: None,
+            error: None,
+        }
+    }
+}
+
+/// Notes in a stage's directory that its artifact was there already.
+pub fn note_cached(work: &Work, directory: &Path, cache: &Cache) -> Result<(), RunError> {
+    if StageRecord::read(directory).is_some_and(|record| record.state == State::Done) {
+        return Ok(());
+    }
+    files::create_directory(directory)?;
+    let mut record = StageRecord::new(work, cache);
+    record.state = State::Done;
+    record.found = cache.made(&work.key);
+    record.write(directory)
+}
+
+/// What a stage needs beside its own work.
+#[derive(Debug)]
+pub struct Surroundings<'a> {
+    pub cache: &'a Cache,
+    pub data: &'a BTreeMap<String, PathBuf>,
+    pub progress: &'a Progress,
+    pub interrupt: &'a Interrupt,
+}
+
+/// Does one piece of work in `directory` and puts the artifact into the cache. The caller holds the key's lock.
+pub fn make(
+    work: &Work,
+    label: &str,
+    directory: &Path,
+    around: &Surroundings<'_>,
+) -> Result<StageRecord, RunError> {
+    let op = work.op()?;
+    let checkpoints = directory.join("checkpoints");
+    files::create_directory(&checkpoints)?;
+    let mut record = StageRecord::read(directory)
+        .filter(|record| record.key == work.key)
+        .unwrap_or_else(|| StageRecord::new(work, around.cache));
+    record.state = State::Running;
+    record.attempts += 1;
+    record.started = Some(environment::now_text());
+    record.ended = None;
+    record.error = None;
+    record.write(directory)?;
+
+    let mut context = Context {
+        stage: &work.stage,
+        inputs: inputs(work, around.cache)?,
+        output: around.cache.begin(&work.key)?,
+        checkpoints,
+        seed: work.seed,
+        data: around.data,
+        metrics: Some(Metrics::open(directory, hparams(&work.settings))?),
+        log: directory.join("log.txt"),
+        log_file: None,
+        failed: None,
+        task: around.progress.task(label),
+        interrupt: around.interrupt,
+    };
+    // A panic is a bug of the op; the rest of the run and its record must not suffer from it.
+    let result = catch_unwind(AssertUnwindSafe(|| op.run(&work.settings, &mut context)));
+    let result = match result {
+        Ok(result) => result.map_err(|error| explain(&work.stage, error)),
+        Err(panic) => Err(RunError::Stage {
+            stage: work.stage.clone(),
+            code: "E0806".into(),
+            message: format!("a bug in op `{}`: {}", work.op, panic_text(panic.as_ref())),
+            help: "please report it with the run's directory; everything finished before it stays"
+                .into(),
+            exit: 2,
+        }),
+    };
+    let seconds = context.task.seconds();
+    record.seconds += seconds;
+    let result = context.close(result).and_then(|contents| {
+        let made = Made {
+            op: work.op.clone(),
+            seconds: record.seconds,
+            host: environment::host(),
+            at: environment::now_text(),
+            stage: stage_path(directory, around.cache),
+        };
+        around
+            .cache
+            .publish(&work.key, &work.kind, recipe(work), contents, &made)
+    });
+    record.ended = Some(environment::now_text());
+    match &result {
+        Ok(_) => record.state = State::Done,
+        Err(RunError::Interrupted) => record.state = State::Interrupted,
+        Err(error) => {
+            record.state = State::Failed;
+            record.error = Some(error.failure());
+        }
+    }
+    if result.is_err() {
+        around.cache.abandon(&work.key)?;
+    }
+    match (result, record.write(directory)) {
+        (Ok(_), written) => written.map(|()| record),
+        // The first error is the cause; that its record could not be written follows from it.
+        (Err(error), _) => Err(error),
+    }
+}
+
+fn stage_path(directory: &Path, cache: &Cache) -> String {
+    let runs = cache.root().parent().unwrap_or(Path::new(""));
+    let relative = directory.strip_prefix(runs).unwrap_or(directory);
+    relative.to_string_lossy().into_owned()
+}
+
+/// What decided the artifact, for its manifest. Paths stay out: where a file lies decides nothing.
+pub fn recipe(work: &Work) -> Recipe {
+    let mut settings = work.settings.clone();
+    for file in &work.files {
+        let mut at = Some(&mut settings);
+        for part in file.key.split('.') {
+            at = match at {
+                Some(Value::Object(map)) => map.get_mut(part),
+                Some(Value::Array(items)) => {
+                    part.parse().ok().and_then(|i: usize| items.get_mut(i))
+                }
+                _ => None,
+            };
+        }
+        if let Some(value) = at {
+            *value = Value::Null;
+        }
+    }
+    Recipe {
+        op: work.op.clone(),
+        version: work.version,
+        seed: work.seeded.then_some(work.seed),
+        settings,
+        files: work
+            .files
+            .iter()
+            .map(|file| (file.key.clone(), file.blake3.clone()))
+            .collect(),
+        inputs: work
+            .inputs
+            .iter()
+            .map(|port| {
+                (
+                    port.port.clone(),
+                    port.from.iter().map(|(_, key)| *key).collect(),
+                )
+            })
+            .collect(),
+    }
+}
+
+fn inputs(work: &Work, cache: &Cache) -> Result<Vec<(String, Vec<InputArtifact>)>, RunError> {
+    let mut ports = Vec::new();
+    for port in &work.inputs {
+        let mut artifacts = Vec::new();
+        for (stage, key) in &port.from {
+            let manifest = match cache.look(key) {
+                Entry::Whole(manifest) => manifest,
+                Entry::Absent | Entry::Damaged(_) => {
+                    return Err(RunError::Changed {
+                        what: format!("the artifact of `{stage}`"),
+                        detail: format!("`{}` is gone or damaged", cache.path(key).display()),
+                    });
+                }
+            };
+            artifacts.push(InputArtifact {
+                stage: stage.clone(),
+                op: manifest.recipe.op,
+                path: cache.path(key),
+                contents: manifest.contents,
+            });
+        }
+        ports.push((port.port.clone(), artifacts));
+    }
+    Ok(ports)
+}
+
+/// Settings as TensorBoard shows them: dotted names to scalars.
+fn hparams(settings: &Value) -> Vec<(String, Value)> {
+    fn flatten(prefix: &str, value: &Value, flat: &mut Vec<(String, Value)>) {
+        match value {
+            Value::Object(map) => {
+                for (name, value) in map {
+                    let dot = if prefix.is_empty() { "" } else { "." };
+                    flatten(&format!("{prefix}{dot}{name}"), value, flat);
+                }
+            }
+            Value::Null => {}
+            other => flat.push((prefix.to_owned(), other.clone())),
+        }
+    }
+    let mut flat = Vec::new();
+    flatten("", settings, &mut flat);
+    flat
+}
+
+/// What an op sees.
+struct Context<'a> {
+    stage: &'a str,
+    inputs: Vec<(String, Vec<InputArtifact>)>,
+    output: PathBuf,
+    checkpoints: PathBuf,
+    seed: u64,
+    data: &'a BTreeMap<String, PathBuf>,
+    metrics: Option<Metrics>,
+    log: PathBuf,
+    log_file: Option<File>,
+    /// A log line that could not be written: reported at the next chance.
+    failed: Option<RunError>,
+    task: Task<'a>,
+    interrupt: &'a Interrupt,
+}
+
+impl Context<'_> {
+    /// Ends the records; what they could not write fails a stage that succeeded otherwise.
+    fn close(&mut self, result: Result<Value, RunError>) -> Result<Value, RunError> {
+        let status = match &result {
+            Ok(_) => SessionStatus::Success,
+            Err(RunError::Interrupted) => SessionStatus::Running,
+            Err(_) => SessionStatus::Failure,
+        };
+        let ended = self
+            .metrics
+            .take()
+            .map_or(Ok(()), |metrics| metrics.finish(status));
+        let contents = result?;
+        ended?;
+        self.failed.take().map_or(Ok(contents), Err)
+    }
+
+    fn metrics(&mut self) -> Result<&mut Metrics, StageError> {
+        if let Some(error) = self.failed.take() {
+            return Err(error.into());
+        }
+        self.metrics.as_mut().ok_or(StageError::Interrupted)
+    }
+}
+
+impl StageContext for Context<'_> {
+    fn stage(&self) -> &str {
+        self.stage
+    }
+
+    fn inputs(&self, port: &str) -> &[InputArtifact] {
+        let found = self.inputs.iter().find(|(name, _)| name == port);
+        found.map_or(&[], |(_, artifacts)| artifacts)
+    }
+
+    fn output(&self) -> &Path {
+        &self.output
+    }
+
+    fn checkpoints(&self) -> &Path {
+        &self.checkpoints
+    }
+
+    fn seed(&self) -> u64 {
+        self.seed
+    }
+
+    fn data_root(&self, name: &str) -> Option<&Path> {
+        self.data.get(name).map(PathBuf::as_path)
+    }
+
+    fn record(&mut self, step: u64, scalars: &[(&str, f64)]) -> Result<(), StageError> {
+        Ok(self.metrics()?.scalars(step, scalars)?)
+    }
+
+    fn record_text(&mut self, step: u64, name: &str, text: &str) -> Result<(), StageError> {
+        Ok(self.metrics()?.text(step, name, text)?)
+    }
+
+    fn record_histogram(
+        &mut self,
+        step: u64,
+        name: &str,
+        values: &[f32],
+    ) -> Result<(), StageError> {
+        Ok(self.metrics()?.histogram(step, name, values)?)
+    }
+
+    fn progress(&mut self, done: u64, total: u64, unit: &str) {
+        self.task.update(done, total, unit);
+    }
+
+    fn log(&mut self, line: &str) {
+        let line = format!("{} {line}\n", environment::now_text());
+        let open = self.log_file.take();
+        let write = || -> std::io::Result<File> {
+            let mut file = match open {
+                Some(file) => file,
+                None => File::options().create(true).append(true).open(&self.log)?,
+            };
+            file.write_all(line.as_bytes())?;
+            Ok(file)
+        };
+        match write().at("writing", &self.log) {
+            Ok(file) => self.log_file = Some(file),
+            Err(error) => self.failed = Some(error),
+        }
+    }
+
+    fn flush(&mut self) -> Result<(), StageError> {
+        Ok(self.metrics()?.flush()?)
+    }
+
+    fn interrupted(&self) -> bool {
+        self.interrupt.requested()
+    }
+}
+
+/// Turns what an op reports into what the run reports.
+fn explain(stage: &str, error: StageError) -> RunError {
+    if let Some(full) = full_disk(&error) {
+        return full;
+    }
+    match error {
+        StageError::Interrupted => RunError::Interrupted,
+        StageError::Input {
+            code,
+            message,
+            help,
+        } => RunError::Stage {
+            stage: stage.into(),
+            code: code.to_string(),
+            message,
+            help,
+            exit: 1,
+        },
+        StageError::Io { path, error } => RunError::io("working on", Path::new(&path), error),
+        StageError::Other(error) => match error.downcast::<RunError>() {
+            Ok(error) => *error,
+            Err(error) => RunError::Stage {
+                stage: stage.into(),
+                code: "E0806".into(),
+                message: chain(error.as_ref()),
+                help: String::new(),
+                exit: 2,
+            },
+        },
+    }
+}
+
+/// A full disk is a full disk, however deep the science wrapped it.
+fn full_disk(error: &StageError) -> Option<RunError> {
+    let mut path = PathBuf::from("the stage's files");
+    if let StageError::Io { path: at, .. } = error {
+        path = at.into();
+    }
+    let mut next: Option<&(dyn std::error::Error + 'static)> = Some(error);
+    while let Some(error) = next {
+        if let Some(io) = error.downcast_ref::<std::io::Error>() {
+            use std::io::ErrorKind::{QuotaExceeded, StorageFull};
+            if matches!(io.kind(), StorageFull | QuotaExceeded) {
+                return Some(RunError::NoSpace {
+                    action: "writing",
+                    path,
+                });
+            }
+        }
+        next = error.source();
+    }
+    None
+}
+
+fn chain(error: &(dyn std::error::Error + 'static)) -> String {
+    let mut text = error.to_string();
+    let mut next = error.source();
+    while let Some(error) = next {
+        let cause = error.to_string();
+        // Many errors repeat their cause in their own words.
+        if !text.contains(&cause) {
+            text = format!("{text}: {cause}");
+        }
+        next = error.source();
+    }
+    text
+}
+
+fn panic_text(panic: &(dyn std::any::Any + Send)) -> String {
+    let text = panic.downcast_ref::<&str>().map(|text| (*text).to_owned());
+    let text = text.or_else(|| panic.downcast_ref::<String>().cloned());
+    text.unwrap_or_else(|| "it panicked without a message".into())
+}
