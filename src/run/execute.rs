@@ -12,15 +12,12 @@ use super::schedule::{Schedule, Work};
 use super::stage::{self, Surroundings};
 use super::{provenance, report};
 use crate::experiment::Experiment;
-use crate::experiment::diagnostic::Span;
 use std::collections::BTreeSet;
 use std::path::Path;
 
 /// What to run, and how.
 pub struct Job<'a> {
     pub experiment: &'a Experiment,
-    /// `file:line` of a span, for `resolved.yaml`.
-    pub cite: &'a dyn Fn(Span) -> String,
     /// The directory of runs; the cache lies in it.
     pub runs: &'a Path,
     /// Only this stage, and what it needs.

@@ -6,6 +6,7 @@
 //! * [`checkpoint`] what a stage keeps to go on from; [`metrics`] and [`tensorboard`] what a stage records; [`progress`] what a person sees meanwhile; [`interrupt`] Ctrl-C
 //! * [`schedule`] what there is to do; [`stage`] one piece of it; [`execute`] all of it
 //! * [`provenance`] where everything came from; [`report`] the run's page
+//! * [`verify`] whether it still holds; [`gc`] what can go
 //! * [`environment`] the only place that looks at machine, git and clock
 
 pub mod cache;
@@ -15,6 +16,7 @@ pub mod environment;
 pub mod error;
 pub mod execute;
 pub mod files;
+pub mod gc;
 pub mod interrupt;
 pub mod lock;
 mod markdown;
@@ -26,6 +28,7 @@ pub mod report;
 pub mod schedule;
 pub mod stage;
 pub mod tensorboard;
+pub mod verify;
 
 pub use cache::{Cache, Key, Manifest};
 pub use error::RunError;

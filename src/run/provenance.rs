@@ -71,7 +71,7 @@ fn write_source(
 ) -> Result<(), RunError> {
     files::create_directory(directory)?;
     let mut names = Vec::new();
-    for (index, layer) in job.experiment.layers.iter().enumerate() {
+    for (index, layer) in job.experiment.sources.iter().enumerate() {
         let file = format!("{index:02}-{}", file_name(&layer.name));
         files::write(&directory.join(&file), layer.text.as_bytes())?;
         names.push(serde_json::json!({"file": file, "layer": layer.name}));
@@ -218,8 +218,8 @@ fn write_value(
 fn origin(job: &Job<'_>, stage: &Stage, path: &str) -> String {
     let mut path = path;
     loop {
-        if let Some(span) = stage.spans.get(path) {
-            return format!("  # from {}", (job.cite)(*span));
+        if let Some(trace) = stage.traces.get(path) {
+            return format!("  # from {}", job.experiment.sources.cite(trace.span));
         }
         match path.rsplit_once('.') {
             Some((outer, _)) => path = outer,

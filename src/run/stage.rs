@@ -98,9 +98,7 @@ pub fn make(
     directory: &Path,
     around: &Surroundings<'_>,
 ) -> Result<StageRecord, RunError> {
-    let op = work.op()?;
-    let checkpoints = directory.join("checkpoints");
-    files::create_directory(&checkpoints)?;
+    files::create_directory(directory)?;
     let mut record = StageRecord::read(directory)
         .filter(|record| record.key == work.key)
         .unwrap_or_else(|| StageRecord::new(work, around.cache));
@@ -111,36 +109,10 @@ pub fn make(
     record.error = None;
     record.write(directory)?;
 
-    let mut context = Context {
-        stage: &work.stage,
-        inputs: inputs(work, around.cache)?,
-        output: around.cache.begin(&work.key)?,
-        checkpoints,
-        seed: work.seed,
-        data: around.data,
-        metrics: Some(Metrics::open(directory, hparams(&work.settings))?),
-        log: directory.join("log.txt"),
-        log_file: None,
-        failed: None,
-        task: around.progress.task(label),
-        interrupt: around.interrupt,
-    };
-    // A panic is a bug of the op; the rest of the run and its record must not suffer from it.
-    let result = catch_unwind(AssertUnwindSafe(|| op.run(&work.settings, &mut context)));
-    let result = match result {
-        Ok(result) => result.map_err(|error| explain(&work.stage, error)),
-        Err(panic) => Err(RunError::Stage {
-            stage: work.stage.clone(),
-            code: "E0806".into(),
-            message: format!("a bug in op `{}`: {}", work.op, panic_text(panic.as_ref())),
-            help: "please report it with the run's directory; everything finished before it stays"
-                .into(),
-            exit: 2,
-        }),
-    };
-    let seconds = context.task.seconds();
+    let output = around.cache.begin(&work.key)?;
+    let (seconds, result) = perform(work, label, directory, output, around);
     record.seconds += seconds;
-    let result = context.close(result).and_then(|contents| {
+    let result = result.and_then(|contents| {
         let made = Made {
             op: work.op.clone(),
             seconds: record.seconds,
@@ -169,6 +141,67 @@ pub fn make(
         // The first error is the cause; that its record could not be written follows from it.
         (Err(error), _) => Err(error),
     }
+}
+
+/// Does one piece of work again, in a scratch directory with `checkpoints/` to start from, and gives the directory of what
+/// it made. Nothing of the run or the cache changes.
+pub fn redo(
+    work: &Work,
+    label: &str,
+    scratch: &Path,
+    around: &Surroundings<'_>,
+) -> Result<PathBuf, RunError> {
+    let output = scratch.join("output");
+    files::create_directory(&output)?;
+    let (_, result) = perform(work, label, scratch, output.clone(), around);
+    result.map(|_| output)
+}
+
+/// Runs the op: its seconds, and what it says of its artifact.
+fn perform(
+    work: &Work,
+    label: &str,
+    directory: &Path,
+    output: PathBuf,
+    around: &Surroundings<'_>,
+) -> (f64, Result<Value, RunError>) {
+    let prepare = || -> Result<_, RunError> {
+        let checkpoints = directory.join("checkpoints");
+        files::create_directory(&checkpoints)?;
+        let context = Context {
+            stage: &work.stage,
+            inputs: inputs(work, around.cache)?,
+            output,
+            checkpoints,
+            seed: work.seed,
+            data: around.data,
+            metrics: Some(Metrics::open(directory, hparams(&work.settings))?),
+            log: directory.join("log.txt"),
+            log_file: None,
+            failed: None,
+            task: around.progress.task(label),
+            interrupt: around.interrupt,
+        };
+        Ok((work.op()?, context))
+    };
+    let (op, mut context) = match prepare() {
+        Ok(prepared) => prepared,
+        Err(error) => return (0.0, Err(error)),
+    };
+    // A panic is a bug of the op; the rest of the run and its record must not suffer from it.
+    let result = catch_unwind(AssertUnwindSafe(|| op.run(&work.settings, &mut context)));
+    let result = match result {
+        Ok(result) => result.map_err(|error| explain(&work.stage, error)),
+        Err(panic) => Err(RunError::Stage {
+            stage: work.stage.clone(),
+            code: "E0806".into(),
+            message: format!("a bug in op `{}`: {}", work.op, panic_text(panic.as_ref())),
+            help: "please report it with the run's directory; everything finished before it stays"
+                .into(),
+            exit: 2,
+        }),
+    };
+    (context.task.seconds(), context.close(result))
 }
 
 fn stage_path(directory: &Path, cache: &Cache) -> String {
@@ -416,7 +449,11 @@ fn full_disk(error: &StageError) -> Option<RunError> {
     if let StageError::Io { path: at, .. } = error {
         path = at.into();
     }
-    let mut next: Option<&(dyn std::error::Error + 'static)> = Some(error);
+    let mut next: Option<&(dyn std::error::Error + 'static)> = match error {
+        // Transparent: its own source would skip the error that it wraps.
+        StageError::Other(inner) => Some(inner.as_ref()),
+        other => Some(other),
+    };
     while let Some(error) = next {
         if let Some(io) = error.downcast_ref::<std::io::Error>() {
             use std::io::ErrorKind::{QuotaExceeded, StorageFull};

@@ -8,5 +8,6 @@ mod trajectories;
 
 mod language;
 mod language_ops;
+mod run;
 mod view;
 mod vq_structure;

@@ -1,8 +1,8 @@
 //! Runs as the library executes them, with two small ops of the tests' own: what is cached, redone, resumed, refused.
 
 use reviv::experiment::{
-    ArtifactKind, Arity, Cell, Description, Edge, Experiment, Graph, Inputs, Op, OpEntry, Port, Problem, Stage,
-    StageContext, StageError,
+    Arity, ArtifactKind, Cell, Description, Edge, Experiment, Graph, Inputs, Op, OpEntry, Port,
+    Problem, Stage, StageContext, StageError,
 };
 use reviv::run::execute::{Job, Outcome, cache_of, execute};
 use reviv::run::record::RunDirectory;
@@ -44,7 +44,11 @@ impl Op for Numbers {
     fn check(&self, _: &NumbersSettings, _: &Inputs<'_>, _: &mut Vec<Problem>) -> Description {
         Description::default()
     }
-    fn run(&self, settings: &NumbersSettings, context: &mut dyn StageContext) -> Result<Value, StageError> {
+    fn run(
+        &self,
+        settings: &NumbersSettings,
+        context: &mut dyn StageContext,
+    ) -> Result<Value, StageError> {
         use rand::RngExt;
         let mut numbers: Vec<f64> = Vec::new();
         if let Some((_, path)) = checkpoint::latest(context.checkpoints()) {
@@ -59,11 +63,16 @@ impl Op for Numbers {
             if step % 10 == 0 {
                 checkpoint::save(context, step, |context, directory| {
                     if settings.fail.as_deref() == Some("full_checkpoint") {
-                        return Err(StageError::io(directory)(std::io::ErrorKind::StorageFull.into()));
+                        return Err(StageError::io(directory)(
+                            std::io::ErrorKind::StorageFull.into(),
+                        ));
                     }
                     context.log("checkpoint");
                     let text = serde_json::to_string(&numbers).map_err(StageError::other)?;
-                    Ok(files::write(&directory.join("numbers.json"), text.as_bytes())?)
+                    Ok(files::write(
+                        &directory.join("numbers.json"),
+                        text.as_bytes(),
+                    )?)
                 })?;
             }
             match settings.fail.as_deref() {
@@ -129,14 +138,22 @@ impl Op for Total {
     fn check(&self, _: &TotalSettings, _: &Inputs<'_>, _: &mut Vec<Problem>) -> Description {
         Description::default()
     }
-    fn run(&self, settings: &TotalSettings, context: &mut dyn StageContext) -> Result<Value, StageError> {
+    fn run(
+        &self,
+        settings: &TotalSettings,
+        context: &mut dyn StageContext,
+    ) -> Result<Value, StageError> {
         let input = &context.inputs("numbers")[0];
-        let bytes = std::fs::read(input.path.join("numbers.json")).map_err(StageError::io(&input.path))?;
+        let bytes =
+            std::fs::read(input.path.join("numbers.json")).map_err(StageError::io(&input.path))?;
         let numbers: Vec<f64> = serde_json::from_slice(&bytes).map_err(StageError::other)?;
         assert_eq!(input.contents["count"], numbers.len());
         let sum = numbers.iter().sum::<f64>() * settings.scale;
         files::create_directory(&context.output().join("report"))?;
-        files::write(&context.output().join("report/sum.md"), format!("The sum is **{sum}** <b>.").as_bytes())?;
+        files::write(
+            &context.output().join("report/sum.md"),
+            format!("The sum is **{sum}** <b>.").as_bytes(),
+        )?;
         Ok(json!({"sum": sum}))
     }
 }
@@ -144,7 +161,13 @@ impl Op for Total {
 inventory::submit! { OpEntry(&Numbers) }
 inventory::submit! { OpEntry(&Total) }
 
-fn stage(name: &str, op: &'static dyn reviv::experiment::AnyOp, settings: Value, seed: u64, edges: Vec<Edge>) -> Stage {
+fn stage(
+    name: &str,
+    op: &'static dyn reviv::experiment::AnyOp,
+    settings: Value,
+    seed: u64,
+    edges: Vec<Edge>,
+) -> Stage {
     Stage {
         name: name.into(),
         op,
@@ -153,17 +176,24 @@ fn stage(name: &str, op: &'static dyn reviv::experiment::AnyOp, settings: Value,
         edges,
         files: Vec::new(),
         description: Description::default(),
-        spans: BTreeMap::new(),
+        traces: BTreeMap::new(),
     }
 }
 
 fn cell(arm: &str, seed: u64, numbers: Value, scale: f64) -> Cell {
-    let edge = Edge { port: "numbers", from: vec![0] };
+    let edge = Edge {
+        port: "numbers",
+        from: vec![0],
+    };
     let stages = vec![
         stage("numbers", &Numbers, numbers, seed, Vec::new()),
         stage("total", &Total, json!({"scale": scale}), seed, vec![edge]),
     ];
-    Cell { arm: arm.into(), seed, graph: Graph { stages } }
+    Cell {
+        arm: arm.into(),
+        seed,
+        graph: Graph { stages },
+    }
 }
 
 fn experiment(cells: Vec<Cell>) -> Experiment {
@@ -175,14 +205,18 @@ fn experiment(cells: Vec<Cell>) -> Experiment {
         cells,
         compare: None,
         data: BTreeMap::new(),
-        layers: Vec::new(),
+        sources: reviv::experiment::source::Sources::default(),
     }
 }
 
-fn run_as(experiment: &Experiment, runs: &Path, only: Option<&str>, shard: &str) -> Result<Outcome, RunError> {
+fn run_as(
+    experiment: &Experiment,
+    runs: &Path,
+    only: Option<&str>,
+    shard: &str,
+) -> Result<Outcome, RunError> {
     execute(&Job {
         experiment,
-        cite: &|_| "totals.yaml:1".into(),
         runs,
         only,
         shard: shard.parse().unwrap(),
@@ -198,7 +232,12 @@ fn run(experiment: &Experiment, runs: &Path) -> Outcome {
 /// Every artifact of a cache: relative path to bytes.
 fn artifacts(cache: &Cache) -> BTreeMap<String, Vec<u8>> {
     let mut all = BTreeMap::new();
-    for leaf in cache.entries().unwrap().iter().filter(|leaf| leaf.extension.is_empty()) {
+    for leaf in cache
+        .entries()
+        .unwrap()
+        .iter()
+        .filter(|leaf| leaf.extension.is_empty())
+    {
         for file in files::files_below(&leaf.path).unwrap() {
             let bytes = std::fs::read(leaf.path.join(&file)).unwrap();
             all.insert(format!("{}/{}", leaf.key, file.display()), bytes);
@@ -219,30 +258,55 @@ fn the_same_experiment_asked_for_twice_does_the_work_once() {
     assert_eq!(first.run.path(), second.run.path());
     assert_eq!(before, artifacts(&cache_of(dir.path())));
     let page = std::fs::read_to_string(second.run.report()).unwrap();
-    assert!(page.contains("The sum is <strong>") && page.contains("&lt;b&gt;") && page.contains("data:image/svg+xml"));
+    assert!(
+        page.contains("The sum is <strong>")
+            && page.contains("&lt;b&gt;")
+            && page.contains("data:image/svg+xml")
+    );
 }
 
 #[test]
 fn changing_one_setting_redoes_only_what_depends_on_it() {
     let dir = tempfile::tempdir().unwrap();
-    run(&experiment(vec![cell("", 0, json!({"steps": 25}), 1.0)]), dir.path());
-    let scaled = run(&experiment(vec![cell("", 0, json!({"steps": 25}), 2.0)]), dir.path());
+    run(
+        &experiment(vec![cell("", 0, json!({"steps": 25}), 1.0)]),
+        dir.path(),
+    );
+    let scaled = run(
+        &experiment(vec![cell("", 0, json!({"steps": 25}), 2.0)]),
+        dir.path(),
+    );
     assert_eq!((scaled.made, scaled.found), (1, 1));
-    let longer = run(&experiment(vec![cell("", 0, json!({"steps": 26}), 2.0)]), dir.path());
+    let longer = run(
+        &experiment(vec![cell("", 0, json!({"steps": 26}), 2.0)]),
+        dir.path(),
+    );
     assert_eq!((longer.made, longer.found), (2, 0));
 }
 
 #[test]
 fn arms_and_seeds_share_what_they_agree_on() {
     let dir = tempfile::tempdir().unwrap();
-    let cells = [("one", 1.0), ("two", 2.0)].iter().flat_map(|(arm, scale)| {
-        [0, 1].map(|seed| cell(arm, seed, json!({"steps": 12}), *scale))
-    });
+    let cells = [("one", 1.0), ("two", 2.0)]
+        .iter()
+        .flat_map(|(arm, scale)| [0, 1].map(|seed| cell(arm, seed, json!({"steps": 12}), *scale)));
     let outcome = run(&experiment(cells.collect()), dir.path());
     // Numbers once per seed, totals once per arm and seed.
     assert_eq!((outcome.state, outcome.made), (State::Done, 2 + 4));
-    assert!(outcome.run.path().join("stages/one-s1/total/stage.json").exists());
-    assert!(outcome.run.path().join("stages/shared/numbers/metrics.jsonl").exists());
+    assert!(
+        outcome
+            .run
+            .path()
+            .join("stages/one-s1/total/stage.json")
+            .exists()
+    );
+    assert!(
+        outcome
+            .run
+            .path()
+            .join("stages/shared/numbers/metrics.jsonl")
+            .exists()
+    );
 }
 
 #[test]
@@ -257,14 +321,21 @@ fn an_interrupted_run_goes_on_from_its_checkpoint_and_ends_with_the_same_bytes()
     let resumed = run(&asked, dirs[0].path());
     assert_eq!((resumed.state, resumed.made), (State::Done, 2));
     assert_eq!(resumed.run.path(), stopped.run.path());
-    let steps: Vec<u64> = metrics::read(&stage).unwrap().iter().map(|row| row.step).collect();
+    let steps: Vec<u64> = metrics::read(&stage)
+        .unwrap()
+        .iter()
+        .map(|row| row.step)
+        .collect();
     assert_eq!(steps, (1..=40).collect::<Vec<_>>());
 
     // The other one is only ever asked to finish: a checkpoint at its beginning keeps it from stopping.
     let copy = dirs[1].path();
     run(&asked, copy);
     run(&asked, copy);
-    assert_eq!(artifacts(&cache_of(dirs[0].path())), artifacts(&cache_of(copy)));
+    assert_eq!(
+        artifacts(&cache_of(dirs[0].path())),
+        artifacts(&cache_of(copy))
+    );
 }
 
 #[test]
@@ -278,13 +349,32 @@ fn a_failed_stage_leaves_a_legible_run_and_everything_that_does_not_need_it() {
         let outcome = run(&experiment(cells), dir.path());
         assert_eq!(outcome.state, State::Failed);
         assert_eq!(outcome.failures.len(), 1);
-        assert_eq!((outcome.failures[0].code(), outcome.failures[0].exit_code()), (code, exit));
+        assert_eq!(
+            (outcome.failures[0].code(), outcome.failures[0].exit_code()),
+            (code, exit)
+        );
         let read = outcome.run.read().unwrap();
         assert_eq!(read.state, State::Failed);
         assert_eq!(read.parts["1/1"].error.as_ref().unwrap().code, code);
-        assert!(outcome.run.path().join("stages/good-s0/total/stage.json").exists());
-        assert!(!outcome.run.path().join("stages/bad-s0/total/stage.json").exists());
-        assert!(std::fs::read_to_string(outcome.run.report()).unwrap().contains(code));
+        assert!(
+            outcome
+                .run
+                .path()
+                .join("stages/good-s0/total/stage.json")
+                .exists()
+        );
+        assert!(
+            !outcome
+                .run
+                .path()
+                .join("stages/bad-s0/total/stage.json")
+                .exists()
+        );
+        assert!(
+            std::fs::read_to_string(outcome.run.report())
+                .unwrap()
+                .contains(code)
+        );
     }
 }
 
@@ -292,10 +382,16 @@ fn a_failed_stage_leaves_a_legible_run_and_everything_that_does_not_need_it() {
 fn a_full_disk_fails_the_run_cleanly_and_what_was_finished_stays() {
     for fail in ["full_disk", "full_checkpoint"] {
         let dir = tempfile::tempdir().unwrap();
-        let cells = vec![cell("a", 0, json!({"steps": 15}), 1.0), cell("b", 0, json!({"steps": 15, "fail": fail}), 1.0)];
+        let cells = vec![
+            cell("a", 0, json!({"steps": 15}), 1.0),
+            cell("b", 0, json!({"steps": 15, "fail": fail}), 1.0),
+        ];
         let outcome = run(&experiment(cells), dir.path());
         assert_eq!((outcome.state, outcome.made), (State::Failed, 2));
-        assert_eq!((outcome.failures[0].code(), outcome.failures[0].exit_code()), ("E0502", 2));
+        assert_eq!(
+            (outcome.failures[0].code(), outcome.failures[0].exit_code()),
+            ("E0502", 2)
+        );
         assert_eq!(outcome.run.read().unwrap().state, State::Failed);
     }
 }
@@ -304,30 +400,35 @@ fn a_full_disk_fails_the_run_cleanly_and_what_was_finished_stays() {
 #[test]
 fn a_disk_that_fills_while_metrics_are_written_fails_the_run_cleanly() {
     let dir = tempfile::tempdir().unwrap();
-    let asked = experiment(vec![cell("", 0, json!({"steps": 40, "stop_at": 5}), 1.0)]);
+    let asked = experiment(vec![cell("", 0, json!({"steps": 40, "stop_at": 15}), 1.0)]);
     let stopped = run(&asked, dir.path());
     let file = stopped.run.path().join("stages/numbers/metrics.jsonl");
     std::fs::remove_file(&file).unwrap();
     std::os::unix::fs::symlink("/dev/full", &file).unwrap();
     let full = run(&asked, dir.path());
-    assert_eq!((full.state, full.failures[0].code()), (State::Failed, "E0502"));
+    assert_eq!(
+        (full.state, full.failures[0].code()),
+        (State::Failed, "E0502")
+    );
     std::fs::remove_file(&file).unwrap();
     // The metrics are lost with their disk; the work continues.
-    let stage = files::files_below(&stopped.run.path().join("stages")).unwrap();
-    assert!(!stage.is_empty());
-    run(&asked, dir.path());
     assert_eq!(run(&asked, dir.path()).state, State::Done);
 }
 
 #[test]
 fn a_run_that_another_process_owns_is_refused_with_its_holder() {
     let dir = tempfile::tempdir().unwrap();
-    let asked = experiment(vec![cell("", 0, json!({"steps": 20, "stop_at": 5}), 1.0)]);
+    let asked = experiment(vec![cell("", 0, json!({"steps": 20, "stop_at": 15}), 1.0)]);
     let stopped = run(&asked, dir.path());
     let owner = stopped.run.own(Shard::WHOLE).unwrap();
     let refused = run_as(&asked, dir.path(), None, "1/1").unwrap_err();
     assert_eq!((refused.code(), refused.exit_code()), ("E0801", 1));
-    assert!(refused.to_string().contains(&format!("pid {}", std::process::id())), "{refused}");
+    assert!(
+        refused
+            .to_string()
+            .contains(&format!("pid {}", std::process::id())),
+        "{refused}"
+    );
     drop(owner);
     assert_eq!(run(&asked, dir.path()).state, State::Done);
 }
@@ -339,7 +440,12 @@ fn a_half_written_cache_entry_is_made_again() {
     run(&asked, dir.path());
     let cache = cache_of(dir.path());
     let before = artifacts(&cache);
-    for leaf in cache.entries().unwrap().iter().filter(|leaf| leaf.extension.is_empty()) {
+    for leaf in cache
+        .entries()
+        .unwrap()
+        .iter()
+        .filter(|leaf| leaf.extension.is_empty())
+    {
         for file in files::files_below(&leaf.path).unwrap() {
             std::fs::write(leaf.path.join(file), b"{").unwrap();
         }
@@ -352,7 +458,11 @@ fn a_half_written_cache_entry_is_made_again() {
 #[test]
 fn shards_split_a_sweep_without_a_server() {
     let dir = tempfile::tempdir().unwrap();
-    let cells = || (0..4).map(|seed| cell("a", seed, json!({"steps": 12}), 1.0)).collect();
+    let cells = || {
+        (0..4)
+            .map(|seed| cell("a", seed, json!({"steps": 12}), 1.0))
+            .collect()
+    };
     let first = run_as(&experiment(cells()), dir.path(), None, "1/2").unwrap();
     assert_eq!((first.state, first.made), (State::Queued, 4));
     assert_eq!(first.run.read().unwrap().state, State::Queued);
@@ -375,11 +485,19 @@ fn only_one_stage_can_be_asked_for_by_a_name_that_exists() {
 #[test]
 fn two_processes_that_ask_at_once_do_the_work_once() {
     let dir = tempfile::tempdir().unwrap();
-    let cells = || (0..6).map(|seed| cell("once", seed, json!({"steps": 300}), 1.0)).collect();
+    let cells = || {
+        (0..6)
+            .map(|seed| cell("once", seed, json!({"steps": 300}), 1.0))
+            .collect()
+    };
     let made: usize = std::thread::scope(|scope| {
         let workers = ["1/3", "2/3", "3/3"].map(|shard| {
             let path = dir.path();
-            scope.spawn(move || run_as(&experiment(cells()), path, None, shard).unwrap().made)
+            scope.spawn(move || {
+                run_as(&experiment(cells()), path, None, shard)
+                    .unwrap()
+                    .made
+            })
         });
         workers.map(|worker| worker.join().unwrap()).iter().sum()
     });

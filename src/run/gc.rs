@@ -1,0 +1,106 @@
+//! Prunes the cache: what no run directory refers to, what is damaged, and what killed processes left behind.
+
+use super::cache::Key;
+use super::error::{AtPath, RunError};
+use super::execute::cache_of;
+use super::files;
+use super::lock::{Lock, Mode};
+use super::record::{RunDirectory, State};
+use super::schedule::Schedule;
+use super::stage::StageRecord;
+use serde::Serialize;
+use std::collections::BTreeSet;
+use std::path::{Path, PathBuf};
+
+/// What was pruned, or would be.
+#[derive(Debug, Default, Serialize)]
+pub struct Pruned {
+    pub paths: Vec<PathBuf>,
+    pub bytes: u64,
+    /// Artifacts that runs refer to.
+    pub kept: usize,
+}
+
+/// What to prune.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Options {
+    /// Only say what would go.
+    pub dry_run: bool,
+    /// Also the checkpoints of finished stages; `reviv verify` can then redo no steps from them.
+    pub checkpoints: bool,
+}
+
+/// Prunes the cache of `runs`. An artifact stays as long as a run directory refers to it: delete the run's directory first.
+pub fn prune(runs: &Path, options: Options) -> Result<Pruned, RunError> {
+    let cache = cache_of(runs);
+    let mut pruned = Pruned::default();
+    let (referred, checkpoints) = referred(runs)?;
+    for leaf in cache.entries()? {
+        let whole = leaf.extension.is_empty();
+        if (whole || leaf.extension == "made.json") && referred.contains(&leaf.key) {
+            pruned.kept += usize::from(whole);
+            continue;
+        }
+        let path = cache.lock_path(&leaf.key);
+        // Whoever makes the artifact now holds the lock: leave all of it alone.
+        let Some(lock) = Lock::attempt(&path, Mode::Exclusive)? else {
+            continue;
+        };
+        if leaf.extension != "lock" {
+            pruned.take(&leaf.path, options)?;
+        }
+        if !options.dry_run {
+            lock.remove()?;
+        }
+    }
+    if options.checkpoints {
+        for path in checkpoints {
+            pruned.take(&path, options)?;
+        }
+    }
+    Ok(pruned)
+}
+
+impl Pruned {
+    fn take(&mut self, path: &Path, options: Options) -> Result<(), RunError> {
+        self.bytes += match std::fs::symlink_metadata(path).at("reading", path)? {
+            meta if meta.is_dir() => files::size_below(path)?,
+            meta => meta.len(),
+        };
+        self.paths.push(path.to_path_buf());
+        if options.dry_run {
+            return Ok(());
+        }
+        files::remove(path)
+    }
+}
+
+/// The keys that run directories refer to, and the checkpoints of their finished stages.
+fn referred(runs: &Path) -> Result<(BTreeSet<Key>, Vec<PathBuf>), RunError> {
+    let mut keys = BTreeSet::new();
+    let mut checkpoints = Vec::new();
+    for run in RunDirectory::all(runs)? {
+        let plan = run.path().join("plan.json");
+        if !plan.exists() {
+            if run.is_busy() {
+                return Err(RunError::Request {
+                    message: format!("run `{}` is just being planned", run.name()),
+                    help: "try again in a moment".into(),
+                });
+            }
+            continue;
+        }
+        // A plan that cannot be read stops everything: what it refers to is not known.
+        let schedule: Schedule = files::read_json(&plan)?;
+        for work in &schedule.works {
+            keys.insert(work.key);
+            let directory = run.path().join("stages").join(&work.directory);
+            let done = StageRecord::read(&directory).is_some_and(|r| r.state == State::Done);
+            let home = directory.join("checkpoints");
+            if done && home.is_dir() {
+                checkpoints.push(home);
+            }
+        }
+    }
+    Ok((keys, checkpoints))
+}

@@ -1,0 +1,204 @@
+//! Verifies a run: its inputs and artifacts still have the bytes they had, and doing its work again, from a checkpoint where
+//! there is one, gives the same bytes.
+
+use super::cache::{Cache, Entry, MANIFEST};
+use super::checkpoint;
+use super::environment;
+use super::error::RunError;
+use super::execute::cache_of;
+use super::files;
+use super::interrupt::Interrupt;
+use super::progress::Progress;
+use super::provenance::{DataSeal, LockFile};
+use super::record::RunDirectory;
+use super::schedule::{Schedule, Work};
+use super::stage::{self, Surroundings};
+use serde::Serialize;
+use std::collections::BTreeMap;
+use std::path::Path;
+
+/// One thing that was looked at.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Check {
+    pub what: String,
+    pub verdict: Verdict,
+    /// What was found.
+    pub detail: String,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Verdict {
+    Same,
+    Changed,
+    /// Not looked at, and why.
+    Skipped,
+}
+
+/// How much to do again.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Redo {
+    /// Only hash.
+    Nothing,
+    /// From checkpoints, and whole stages that took less than a minute.
+    Quick,
+    /// Everything.
+    All,
+}
+
+/// Stages without a checkpoint that took longer are only done again when all of it is asked for.
+const QUICK_SECONDS: f64 = 60.0;
+
+/// Looks at everything, in the order of the work.
+pub fn verify(
+    run: &RunDirectory,
+    redo: Redo,
+    progress: &Progress,
+    interrupt: &Interrupt,
+) -> Result<Vec<Check>, RunError> {
+    let schedule: Schedule = files::read_json(&run.path().join("plan.json"))?;
+    let lock: LockFile = files::read_json(&run.path().join("lock.json"))?;
+    let cache = cache_of(run.runs());
+    let mut checks = inputs(&lock);
+    for work in &schedule.works {
+        interrupt.check()?;
+        let label = work.label(schedule.sweep);
+        let hashed = match cache.look(&work.key) {
+            Entry::Absent => Check::new(&label, Verdict::Skipped, "not made yet, or pruned"),
+            _ => Check::of(
+                &label,
+                cache.rehash(&work.key),
+                "same bytes as when it was made",
+            )?,
+        };
+        let same = hashed.verdict == Verdict::Same;
+        checks.push(hashed);
+        if same && redo != Redo::Nothing {
+            progress.say(&format!("  again: {label}"));
+            let around = Surroundings {
+                cache: &cache,
+                data: &schedule.data,
+                progress,
+                interrupt,
+            };
+            checks.push(again(run, work, &label, redo, &around)?);
+        }
+    }
+    Ok(checks)
+}
+
+impl Check {
+    fn new(what: &str, verdict: Verdict, detail: impl Into<String>) -> Self {
+        Self {
+            what: what.into(),
+            verdict,
+            detail: detail.into(),
+        }
+    }
+
+    /// A change is a finding; any other failure is an error of looking.
+    fn of(what: &str, result: Result<(), RunError>, same: &str) -> Result<Self, RunError> {
+        match result {
+            Ok(()) => Ok(Self::new(what, Verdict::Same, same)),
+            Err(RunError::Changed { detail, .. }) => Ok(Self::new(what, Verdict::Changed, detail)),
+            Err(error) => Err(error),
+        }
+    }
+}
+
+fn inputs(lock: &LockFile) -> Vec<Check> {
+    let mut checks = Vec::new();
+    for file in &lock.files {
+        let what = format!("input `{}`", file.path.display());
+        checks.push(match files::hash(&file.path) {
+            Ok((hash, _)) if hash.to_hex().as_str() == file.blake3 => {
+                Check::new(&what, Verdict::Same, "same bytes as when it was read")
+            }
+            Ok(_) => Check::new(&what, Verdict::Changed, "other bytes than when it was read"),
+            Err(error) => Check::new(&what, Verdict::Changed, error.to_string()),
+        });
+    }
+    for (name, seal) in &lock.data {
+        let what = format!("data set `{name}`");
+        checks.push(match DataSeal::of(&seal.root) {
+            Ok(now) if now.listing == seal.listing => {
+                Check::new(&what, Verdict::Same, "same files of the same sizes")
+            }
+            Ok(now) => {
+                let detail = format!("{} files now, {} when it was read", now.files, seal.files);
+                Check::new(&what, Verdict::Changed, detail)
+            }
+            Err(error) => Check::new(&what, Verdict::Changed, error.to_string()),
+        });
+    }
+    checks
+}
+
+/// Does one piece of work again beside the run and compares.
+fn again(
+    run: &RunDirectory,
+    work: &Work,
+    label: &str,
+    redo: Redo,
+    around: &Surroundings<'_>,
+) -> Result<Check, RunError> {
+    let what = format!("{label}, again");
+    let made = around.cache.made(&work.key);
+    let mut kept = run
+        .path()
+        .join("stages")
+        .join(&work.directory)
+        .join("checkpoints");
+    if let Some(made) = made.as_ref().filter(|_| checkpoint::all(&kept).is_empty()) {
+        kept = run.runs().join(&made.stage).join("checkpoints");
+    }
+    let from = checkpoint::all(&kept).into_iter().next();
+    let seconds = made.map_or(f64::INFINITY, |made| made.seconds);
+    if from.is_none() && redo == Redo::Quick && seconds > QUICK_SECONDS {
+        let detail = format!("no checkpoint, and it took {seconds:.0} s; `--all` does it");
+        return Ok(Check::new(&what, Verdict::Skipped, detail));
+    }
+    let scratch = run.path().join(format!(".verify-{}", environment::pid()));
+    files::remove(&scratch)?;
+    if let Some((step, path)) = &from {
+        let name = format!("step-{step:06}");
+        files::copy_tree(path, &scratch.join("checkpoints").join(name))?;
+    }
+    let how = from.map_or_else(
+        || "from the beginning: same bytes".to_owned(),
+        |(step, _)| format!("from step {step}: same bytes"),
+    );
+    let result = stage::redo(work, label, &scratch, around)
+        .and_then(|output| compare(work, around.cache, &output));
+    files::remove(&scratch)?;
+    Check::of(&what, result, &how)
+}
+
+fn compare(work: &Work, cache: &Cache, output: &Path) -> Result<(), RunError> {
+    let changed = |detail: String| RunError::Changed {
+        what: work.stage.clone(),
+        detail,
+    };
+    let Entry::Whole(manifest) = cache.look(&work.key) else {
+        return Err(changed("the artifact went away meanwhile".into()));
+    };
+    let mut now = BTreeMap::new();
+    for file in files::files_below(output)? {
+        let (hash, _) = files::hash(&output.join(&file))?;
+        let name: Vec<_> = file.iter().map(|part| part.to_string_lossy()).collect();
+        now.insert(name.join("/"), hash.to_hex().to_string());
+    }
+    now.remove(MANIFEST);
+    for (name, file) in &manifest.files {
+        match now.remove(name) {
+            None => return Err(changed(format!("`{name}` was not made again"))),
+            Some(hash) if hash != file.blake3 => {
+                return Err(changed(format!("`{name}` came out with other bytes")));
+            }
+            Some(_) => {}
+        }
+    }
+    now.into_keys().next().map_or(Ok(()), |name| {
+        Err(changed(format!("`{name}` was not there the first time")))
+    })
+}
