@@ -1,0 +1,99 @@
+//! What can be wrong with a recording: every error names the file, and the place in it where there is one.
+
+use std::fmt;
+use std::path::{Path, PathBuf};
+
+/// A place in a file.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Place {
+    /// Byte offset from the start of the file.
+    Offset(u64),
+    /// Line, counted from 1.
+    Line(u64),
+    /// Frame or record, counted from 0.
+    Frame(u64),
+    /// The file as a whole.
+    File,
+}
+
+impl fmt::Display for Place {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Place::Offset(offset) => write!(f, ", byte {offset}"),
+            Place::Line(line) => write!(f, ", line {line}"),
+            Place::Frame(frame) => write!(f, ", frame {frame}"),
+            Place::File => Ok(()),
+        }
+    }
+}
+
+/// Why a source cannot give a clip.
+#[derive(Debug, thiserror::Error)]
+pub enum SourceError {
+    /// The operating system says no.
+    #[error("`{}`: {cause}", path.display())]
+    Io {
+        path: PathBuf,
+        #[source]
+        cause: std::io::Error,
+    },
+    /// The file is not what it claims to be: truncated, damaged or hostile.
+    #[error("`{}`{place}: {reason}", path.display())]
+    Malformed {
+        path: PathBuf,
+        place: Place,
+        reason: String,
+    },
+    /// The file is fine, but of a kind that is not read here; the reason says what to do instead.
+    #[error("`{}`: {reason}", path.display())]
+    Unsupported { path: PathBuf, reason: String },
+    /// A file or a part of it that is needed is not there.
+    #[error("`{}`: {reason}", path.display())]
+    Missing { path: PathBuf, reason: String },
+    /// An index beyond the end.
+    #[error("clip {index} of `{source_name}`, which has {len}")]
+    OutOfRange {
+        source_name: String,
+        index: usize,
+        len: usize,
+    },
+    /// Settings that contradict each other or the recording.
+    #[error("{0}")]
+    Settings(String),
+}
+
+impl SourceError {
+    /// An input or output error of `path`.
+    #[must_use]
+    pub fn io(path: &Path, cause: std::io::Error) -> Self {
+        SourceError::Io {
+            path: path.to_owned(),
+            cause,
+        }
+    }
+
+    /// `path` is damaged at `place`.
+    pub fn malformed(path: &Path, place: Place, reason: impl Into<String>) -> Self {
+        SourceError::Malformed {
+            path: path.to_owned(),
+            place,
+            reason: reason.into(),
+        }
+    }
+
+    /// `path` is of a kind that is not read here.
+    pub fn unsupported(path: &Path, reason: impl Into<String>) -> Self {
+        SourceError::Unsupported {
+            path: path.to_owned(),
+            reason: reason.into(),
+        }
+    }
+
+    /// Something needed is not there.
+    pub fn missing(path: &Path, reason: impl Into<String>) -> Self {
+        SourceError::Missing {
+            path: path.to_owned(),
+            reason: reason.into(),
+        }
+    }
+}
