@@ -7,6 +7,9 @@
 //! * `video/`: mp4, folders of frames, and anything the user's `ffmpeg` can read
 
 pub mod error;
+pub mod image;
+mod resize;
+pub mod video;
 
 pub use error::SourceError;
 
@@ -36,17 +39,6 @@ pub trait Source: Send + Sync {
     /// # Errors
     /// When a file cannot be read or is malformed, or `index >= len()`.
     fn clip(&self, index: usize) -> Result<Outcome, SourceError>;
-
-    /// All clips in order, made one at a time.
-    fn clips(&self) -> Clips<'_>
-    where
-        Self: Sized,
-    {
-        Clips {
-            source: self,
-            next: 0,
-        }
-    }
 }
 
 /// What became of one clip.
@@ -96,14 +88,19 @@ impl DropReason {
     }
 }
 
-/// Iterator of [`Source::clips`].
+/// All clips of a source in order, made one at a time.
+pub fn clips<S: Source + ?Sized>(source: &S) -> Clips<'_, S> {
+    Clips { source, next: 0 }
+}
+
+/// Iterator of [`clips`].
 #[derive(Debug)]
-pub struct Clips<'a, S: Source> {
+pub struct Clips<'a, S: Source + ?Sized> {
     source: &'a S,
     next: usize,
 }
 
-impl<S: Source> Iterator for Clips<'_, S> {
+impl<S: Source + ?Sized> Iterator for Clips<'_, S> {
     type Item = Result<Outcome, SourceError>;
 
     fn next(&mut self) -> Option<Self::Item> {

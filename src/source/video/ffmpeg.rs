@@ -1,0 +1,240 @@
+//! Videos through the user's own `ffmpeg`: any container and codec it knows. It is started as a separate program and hands over
+//! its pictures through a pipe as self-describing PPM images; nothing is linked.
+
+use super::choice::Schedule;
+use crate::source::SourceError;
+use crate::source::error::Place;
+use crate::source::image::Image;
+use std::io::{BufRead, BufReader, Read};
+use std::path::{Path, PathBuf};
+use std::process::{Child, ChildStdout, Command, Stdio};
+use std::sync::OnceLock;
+
+const MOST_PIXELS: usize = 64_000_000;
+
+/// Whether there is an `ffmpeg` to call; asked once per process.
+pub fn available() -> bool {
+    static FOUND: OnceLock<bool> = OnceLock::new();
+    *FOUND.get_or_init(|| {
+        Command::new("ffmpeg")
+            .arg("-version")
+            .stdin(Stdio::null())
+            .stdout(Stdio::null())
+            .stderr(Stdio::null())
+            .status()
+            .is_ok_and(|status| status.success())
+    })
+}
+
+/// A file that `ffmpeg` reads.
+#[derive(Debug, Clone)]
+pub struct Index {
+    path: PathBuf,
+    /// Presentation time of the first frame on ffmpeg's own clock, seconds.
+    first: f64,
+}
+
+fn command(path: &Path, before_input: &[String]) -> Command {
+    let mut command = Command::new("ffmpeg");
+    command
+        .args(["-nostdin", "-v", "error"])
+        .args(before_input)
+        .arg("-i")
+        // `file:` keeps a name with a colon from being taken as a protocol, and protocols out altogether.
+        .arg({
+            let mut input = std::ffi::OsString::from("file:");
+            input.push(path);
+            input
+        })
+        .args(["-map", "0:v:0"])
+        .stdin(Stdio::null())
+        .stderr(Stdio::piped());
+    command
+}
+
+/// Reads when every frame is shown, without decoding.
+pub fn open(path: &Path) -> Result<(Index, Schedule), SourceError> {
+    let output = command(path, &[])
+        .args(["-c", "copy", "-f", "framecrc", "-"])
+        .output()
+        .map_err(|cause| SourceError::io(path, cause))?;
+    let text = String::from_utf8_lossy(&output.stdout);
+    let mut tick = None;
+    let mut ticks = Vec::new();
+    for line in text.lines() {
+        if let Some(base) = line.strip_prefix("#tb 0:") {
+            tick = base
+                .trim()
+                .split_once('/')
+                .and_then(|(n, d)| Some((n.parse::<f64>().ok()?, d.parse::<f64>().ok()?)));
+        } else if !line.starts_with('#') {
+            // stream, dts, pts, duration, size, checksum
+            if let Some(pts) = line
+                .split(',')
+                .nth(2)
+                .and_then(|pts| pts.trim().parse::<i64>().ok())
+            {
+                ticks.push(pts);
+            }
+        }
+    }
+    ticks.sort_unstable();
+    let (Some((numerator, denominator)), Some(&first)) = (tick, ticks.first()) else {
+        return Err(SourceError::malformed(
+            path,
+            Place::File,
+            format!("ffmpeg finds no video in it{}", complaint(&output.stderr)),
+        ));
+    };
+    let scale = numerator / denominator;
+    // Schedule works on integer ticks per second: microseconds are fine enough for any camera.
+    let micros: Vec<i64> = ticks
+        .iter()
+        .map(|pts| ((pts - first) as f64 * scale * 1e6).round() as i64)
+        .collect();
+    let index = Index {
+        path: path.to_owned(),
+        first: first as f64 * scale,
+    };
+    Ok((index, Schedule::from_ticks(&micros, 1_000_000)))
+}
+
+fn complaint(stderr: &[u8]) -> String {
+    let text = String::from_utf8_lossy(stderr);
+    match text.lines().rev().find(|line| !line.trim().is_empty()) {
+        Some(line) => format!(": {}", line.trim()),
+        None => String::new(),
+    }
+}
+
+/// The wanted frames, decoded and turned upright by `ffmpeg`.
+#[derive(Debug)]
+pub struct Wanted {
+    path: PathBuf,
+    child: Child,
+    pipe: BufReader<ChildStdout>,
+    frames: Vec<usize>,
+    delivered: usize,
+}
+
+impl Wanted {
+    /// `frames` in ascending order without repetition.
+    pub fn new(
+        index: &Index,
+        schedule: &Schedule,
+        frames: Vec<usize>,
+    ) -> Result<Self, SourceError> {
+        let first = frames.first().copied().unwrap_or(0);
+        let last = frames.last().copied().unwrap_or(0);
+        let mut seek = Vec::new();
+        if first > 0 {
+            // Half a frame early: times are rounded on their way through the container.
+            let early = f64::midpoint(schedule.seconds(first), schedule.seconds(first - 1));
+            seek = vec!["-ss".to_owned(), format!("{:.6}", index.first + early)];
+        }
+        let dense = frames.len() == last - first + 1;
+        let mut command = command(&index.path, &seek);
+        if !dense {
+            let list: Vec<String> = frames
+                .iter()
+                .map(|frame| format!("eq(n\\,{})", frame - first))
+                .collect();
+            command.args(["-vf", &format!("select={}", list.join("+"))]);
+        }
+        command
+            .args(["-fps_mode", "passthrough", "-frames:v"])
+            .arg(frames.len().max(1).to_string())
+            .args(["-pix_fmt", "rgb24", "-c:v", "ppm", "-f", "image2pipe", "-"])
+            .stdout(Stdio::piped());
+        let mut child = command
+            .spawn()
+            .map_err(|cause| SourceError::io(&index.path, cause))?;
+        let pipe = child
+            .stdout
+            .take()
+            .ok_or_else(|| SourceError::unsupported(&index.path, "ffmpeg gave no pipe"))?;
+        Ok(Wanted {
+            path: index.path.clone(),
+            child,
+            pipe: BufReader::with_capacity(1 << 16, pipe),
+            frames,
+            delivered: 0,
+        })
+    }
+
+    fn read(&mut self) -> Result<Option<Image>, String> {
+        let mut header = Vec::new();
+        // "P6\n1920 1080\n255\n"
+        for _ in 0..3 {
+            let mut limited = (&mut self.pipe).take(64);
+            let read = limited
+                .read_until(b'\n', &mut header)
+                .map_err(|cause| cause.to_string())?;
+            if read == 0 && header.is_empty() {
+                return Ok(None);
+            }
+        }
+        let text = String::from_utf8_lossy(&header);
+        let mut words = text.split_ascii_whitespace();
+        let (Some("P6"), Some(width), Some(height), Some("255")) = (
+            words.next(),
+            words.next().and_then(|word| word.parse::<usize>().ok()),
+            words.next().and_then(|word| word.parse::<usize>().ok()),
+            words.next(),
+        ) else {
+            return Err("ffmpeg sent something that is no picture".to_owned());
+        };
+        if width == 0 || height == 0 || width.saturating_mul(height) > MOST_PIXELS {
+            return Err(format!("a picture of {width} x {height} pixels"));
+        }
+        let mut data = vec![0; width * height * 3];
+        self.pipe
+            .read_exact(&mut data)
+            .map_err(|_| "ffmpeg stopped in the middle of a picture".to_owned())?;
+        Ok(Some(Image {
+            width: width as u32,
+            height: height as u32,
+            data,
+        }))
+    }
+
+    fn failure(&mut self, frame: usize, reason: &str) -> SourceError {
+        let mut stderr = Vec::new();
+        let _ = self.child.kill();
+        if let Some(pipe) = self.child.stderr.take() {
+            let _ = pipe.take(1 << 16).read_to_end(&mut stderr);
+        }
+        SourceError::malformed(
+            &self.path,
+            Place::Frame(frame as u64),
+            format!("{reason}{}", complaint(&stderr)),
+        )
+    }
+}
+
+impl Iterator for Wanted {
+    type Item = Result<(usize, Image), SourceError>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        let frame = *self.frames.get(self.delivered)?;
+        self.delivered += 1;
+        Some(match self.read() {
+            Ok(Some(image)) => Ok((frame, image)),
+            Ok(None) => {
+                self.delivered = self.frames.len();
+                Err(self.failure(frame, "ffmpeg decodes no such frame"))
+            }
+            Err(reason) => {
+                self.delivered = self.frames.len();
+                Err(self.failure(frame, &reason))
+            }
+        })
+    }
+}
+
+impl Drop for Wanted {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
