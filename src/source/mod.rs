@@ -4,8 +4,10 @@
 //! this order:
 //!
 //! * [`error`]: what can be wrong with a file, always with the place in it
-//! * `video/`: mp4, folders of frames, and anything the user's `ffmpeg` can read
+//! * [`video`]: mp4, folders of frames, and anything the user's `ffmpeg` can read
+//! * [`aria`]: recordings of Project Aria glasses
 
+pub mod aria;
 pub mod error;
 pub mod image;
 mod resize;

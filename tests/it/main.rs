@@ -3,6 +3,7 @@
 
 mod metrics;
 mod parity;
+mod recordings_video;
 mod shared;
 mod trajectories;
 

@@ -1,0 +1,3 @@
+//! Recordings of Project Aria glasses: the container ([`vrs`]).
+
+pub mod vrs;
