@@ -8,9 +8,13 @@
 //! * [`aria`]: recordings of Project Aria glasses
 
 pub mod aria;
+pub mod csv;
+pub mod dataset;
 pub mod error;
 pub mod image;
+pub mod recording;
 mod resize;
+pub mod track;
 pub mod video;
 
 pub use error::SourceError;

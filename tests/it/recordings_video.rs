@@ -1,13 +1,23 @@
-//! Videos: the embedded decoder against ffmpeg's pixels, seeking, frame choice, rotation, damage.
+//! Videos: the embedded decoder against ffmpeg's pixels, seeking, frame choice, what is beyond it, damage.
 
 use crate::shared;
+use reviv::source::SourceError;
+use reviv::source::image::Image;
 use reviv::source::video::{DecoderChoice, Video, VideoSettings, embedded, ffmpeg, h264, mp4};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 /// CRC-32 of every decoded 4:2:0 picture, made once with ffmpeg 5.1.9: `ffmpeg -i ego_kitchen_1080p30_4s.mp4 -f rawvideo
 /// -pix_fmt yuv420p`, cut into frames of 1920 * 1080 * 3 / 2 bytes.
-const KITCHEN: &str = include_str!("../data/ego_kitchen_1080p30_4s.yuv.crc32");
+const KITCHEN_PLANES: &str = include_str!("../data/ego_kitchen_1080p30_4s.yuv.crc32");
+/// The same with `-pix_fmt rgb24` and 1920 * 1080 * 3 bytes.
+const KITCHEN_RGB: &str = include_str!("../data/ego_kitchen_1080p30_4s.rgb.crc32");
+
+fn golden(text: &str) -> Vec<u32> {
+    text.split_whitespace()
+        .map(|crc| u32::from_str_radix(crc, 16).unwrap())
+        .collect()
+}
 
 fn crc32(parts: &[&[u8]]) -> u32 {
     let mut crc = flate2::Crc::new();
@@ -15,6 +25,10 @@ fn crc32(parts: &[&[u8]]) -> u32 {
         crc.update(part);
     }
     crc.sum()
+}
+
+fn kitchen() -> Option<PathBuf> {
+    Some(shared::folder()?.join("data/video/ego_kitchen_1080p30_4s.mp4"))
 }
 
 fn planes(path: &Path, frames: Vec<usize>) -> Vec<(usize, u32)> {
@@ -33,64 +47,140 @@ fn planes(path: &Path, frames: Vec<usize>) -> Vec<(usize, u32)> {
 
 #[test]
 fn decoded_planes_of_the_kitchen_are_ffmpegs_bit_for_bit() {
-    let Some(shared) = shared::folder() else {
-        return;
-    };
-    let path = shared.join("data/video/ego_kitchen_1080p30_4s.mp4");
-    let golden: Vec<u32> = KITCHEN
-        .split_whitespace()
-        .map(|crc| u32::from_str_radix(crc, 16).unwrap())
-        .collect();
-    let chosen = vec![0, 4, 8, 11, 15, 60, 61, 120];
-    for (frame, crc) in planes(&path, chosen) {
+    let Some(path) = kitchen() else { return };
+    let golden = golden(KITCHEN_PLANES);
+    let found = planes(&path, (0..121).collect());
+    assert_eq!(found.len(), 121);
+    for (frame, crc) in found {
         assert_eq!(crc, golden[frame], "frame {frame}");
     }
 }
 
+/// Skipping pictures that nothing refers to, and starting in the middle, change no pixel of what is wanted.
 #[test]
-fn dev() {
+fn chosen_frames_have_the_pixels_of_all_frames_and_ffmpegs_colours() {
+    let Some(path) = kitchen() else { return };
+    let golden = golden(KITCHEN_RGB);
+    let video = Video::open(&path).unwrap();
+    assert_eq!(
+        (
+            video.info().width,
+            video.info().height,
+            video.info().fps,
+            video.info().frames
+        ),
+        (1920, 1080, 30.0, 121)
+    );
+    for frame in video.chosen(vec![4, 8, 11, 19, 100, 120]).unwrap() {
+        let frame = frame.unwrap();
+        assert_eq!(
+            crc32(&[&frame.image.data]),
+            golden[frame.index],
+            "frame {}",
+            frame.index
+        );
+        assert!((frame.seconds - frame.index as f64 / 30.0).abs() < 1e-9);
+    }
+}
+
+#[test]
+fn four_four_four_goes_through_ffmpeg_and_equals_its_pngs() {
     let Some(shared) = shared::folder() else {
         return;
     };
-    let path = shared.join("data/video/ego_kitchen_1080p30_4s.mp4");
-    let video = Video::open(&path).unwrap();
-    eprintln!("{:?}", video.info());
-    let gen2 = Video::open(shared.join("data/video/aria_gen2_outdoor_10fps_2p4s.mp4")).unwrap();
-    eprintln!("{:?}", gen2.info());
-    let t = std::time::Instant::now();
-    let clip = video.load_clip(0, 8.0, 16, 256).unwrap();
-    eprintln!("load_clip {:?} {:?}", t.elapsed(), clip.frames.shape());
-    let ff = Video::open_with(
+    let path = shared.join("data/egom2p_examples/rgb2dep_h2o.mp4");
+    let refused = Video::open_with(
         &path,
         &VideoSettings {
-            decoder: DecoderChoice::Ffmpeg,
-            ..Default::default()
+            decoder: DecoderChoice::Embedded,
+            ..VideoSettings::default()
+        },
+    );
+    let Err(SourceError::Unsupported { reason, .. }) = refused else {
+        panic!("4:4:4 must be refused by the embedded decoder: {refused:?}")
+    };
+    assert!(reason.contains("4:4:4"), "{reason}");
+    if !ffmpeg::available() {
+        eprintln!("skipped: no ffmpeg on the PATH");
+        return;
+    }
+    let clip = Video::open(&path)
+        .unwrap()
+        .load_clip(0, 8.0, 16, 256)
+        .unwrap();
+    let folder = Video::open_with(
+        shared.join("data/egom2p_examples/h2o_rgb_png"),
+        &VideoSettings {
+            folder_fps: 8.0,
+            ..VideoSettings::default()
         },
     )
+    .unwrap()
+    .load_clip(0, 8.0, 16, 256)
     .unwrap();
-    eprintln!("{:?}", ff.info());
-    let t = std::time::Instant::now();
-    let clip2 = ff.load_clip(0, 8.0, 16, 256).unwrap();
-    eprintln!(
-        "ffmpeg load_clip {:?} {:?}",
-        t.elapsed(),
-        clip.frames.shape()
+    assert_eq!(clip.frames, folder.frames);
+}
+
+/// The same clip through the embedded decoder and through ffmpeg.
+#[test]
+fn both_decoders_give_the_same_clip() {
+    let Some(path) = kitchen() else { return };
+    if !ffmpeg::available() {
+        eprintln!("skipped: no ffmpeg on the PATH");
+        return;
+    }
+    let settings = VideoSettings {
+        decoder: DecoderChoice::Ffmpeg,
+        ..VideoSettings::default()
+    };
+    let ours = Video::open(&path)
+        .unwrap()
+        .load_clip(31, 8.0, 4, 256)
+        .unwrap();
+    let theirs = Video::open_with(&path, &settings)
+        .unwrap()
+        .load_clip(31, 8.0, 4, 256)
+        .unwrap();
+    assert_eq!(ours.frames.dim(), (4, 256, 256, 3));
+    let differ = ours
+        .frames
+        .iter()
+        .zip(&theirs.frames)
+        .filter(|(a, b)| a.abs_diff(**b) > 1)
+        .count();
+    assert_eq!(differ, 0);
+}
+
+#[test]
+fn a_clip_is_the_area_resized_centre_square() {
+    let folder = tempfile::tempdir().unwrap();
+    // 12 x 8, left third red, the rest blue: the centre 8 x 8 has its first two columns red.
+    for name in ["f2.png", "f10.png", "f1.png"] {
+        let mut image = Image::filled(12, 8, [0, 0, 255]);
+        for (index, pixel) in image.data.chunks_exact_mut(3).enumerate() {
+            if index % 12 < 4 {
+                pixel.copy_from_slice(&[if name == "f10.png" { 100 } else { 255 }, 0, 0]);
+            }
+        }
+        let picture = ndarray::Array3::from_shape_vec((8, 12, 3), image.data).unwrap();
+        reviv::formats::png::write(
+            &folder.path().join(name),
+            &reviv::formats::png::Picture::Rgb8(picture),
+        )
+        .unwrap();
+    }
+    let video = Video::open(folder.path()).unwrap();
+    assert_eq!(
+        (video.info().frames, video.info().decoder),
+        (3, "folder of pictures")
     );
-    let mut hist = [0usize; 6];
-    for (a, b) in clip.frames.iter().zip(clip2.frames.iter()) {
-        hist[(a.abs_diff(*b) as usize).min(5)] += 1;
-    }
-    eprintln!("clip differences {hist:?}");
-    let a = video.chosen(vec![60]).unwrap().next().unwrap().unwrap();
-    let b = ff.chosen(vec![60]).unwrap().next().unwrap().unwrap();
-    assert_eq!(a.index, b.index);
-    let mut hist = [0usize; 6];
-    for (a, b) in a.image.data.iter().zip(b.image.data.iter()) {
-        hist[(a.abs_diff(*b) as usize).min(5)] += 1;
-    }
-    eprintln!("frame differences {hist:?}");
-    for name in ["rgb2dep_h2o", "dep2rgb_holo"] {
-        let v = Video::open(shared.join(format!("data/egom2p_examples/{name}.mp4")));
-        eprintln!("{:?}", v.map(|v| v.info().clone()));
-    }
+    let clip = video.load_clip(0, 30.0, 5, 4).unwrap();
+    assert_eq!(clip.frames.dim(), (5, 4, 4, 3));
+    let pixel =
+        |t: usize, x: usize| -> Vec<u8> { (0..3).map(|c| clip.frames[[t, 1, x, c]]).collect() };
+    assert_eq!(pixel(0, 0), [255, 0, 0]);
+    assert_eq!(pixel(0, 1), [0, 0, 255]);
+    // f10 comes last, and is repeated beyond the end.
+    assert_eq!([pixel(2, 0)[0], pixel(3, 0)[0], pixel(4, 0)[0]], [100; 3]);
+    assert!(video.load_clip(3, 30.0, 1, 4).is_err());
 }
