@@ -8,6 +8,9 @@ use std::sync::{Arc, Mutex, OnceLock};
 /// Opens one recording of a data set.
 pub type Open = fn(&Path, &CutSettings) -> Result<Recording, SourceError>;
 
+/// An open recording, or room for one.
+type Slot = Arc<OnceLock<Arc<Recording>>>;
+
 /// Recordings of one data set.
 pub struct Recordings {
     name: String,
@@ -18,7 +21,7 @@ pub struct Recordings {
     starts: Vec<usize>,
     modalities: Vec<String>,
     /// The recordings used last, the newest at the end.
-    recent: Mutex<Vec<(usize, Arc<OnceLock<Arc<Recording>>>)>>,
+    recent: Mutex<Vec<(usize, Slot)>>,
     keep: usize,
 }
 

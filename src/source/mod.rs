@@ -7,14 +7,17 @@
 //! * [`video`]: mp4, folders of frames, and anything the user's `ffmpeg` can read
 //! * [`aria`]: recordings of Project Aria glasses
 
+pub mod adt;
 pub mod aria;
 pub mod csv;
 pub mod dataset;
 pub mod error;
+pub mod hot3d;
 pub mod image;
 pub mod recording;
 mod resize;
 pub mod track;
+pub mod umetrack;
 pub mod video;
 
 pub use error::SourceError;

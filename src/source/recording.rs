@@ -180,6 +180,9 @@ impl super::track::Blend for GazeSample {
     }
 }
 
+/// Colour and depth of a clip.
+type ClipVideo = (Option<Rgb>, Option<Depth>);
+
 impl Recording {
     /// A recording of which nothing is known yet.
     #[must_use]
@@ -395,12 +398,11 @@ impl Recording {
     }
 
     /// Colour and depth from `start` on; the inner error is why the clip is dropped.
-    #[allow(clippy::type_complexity)]
     fn video(
         &self,
         start: i64,
         settings: &CutSettings,
-    ) -> Result<Result<(Option<Rgb>, Option<Depth>), DropReason>, SourceError> {
+    ) -> Result<Result<ClipVideo, DropReason>, SourceError> {
         let Some(colour) = &self.colour else {
             return Ok(Ok((None, None)));
         };

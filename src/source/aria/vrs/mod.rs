@@ -195,6 +195,14 @@ impl Vrs {
             .filter(move |entry| entry.stream == stream && entry.kind == kind)
     }
 
+    /// Streams that have records of a kind, as often as they have them.
+    pub fn of_kind(&self, kind: Kind) -> impl Iterator<Item = StreamId> {
+        self.entries
+            .iter()
+            .filter(move |entry| entry.kind == kind)
+            .map(|entry| entry.stream)
+    }
+
     /// Reads and uncompresses a record.
     ///
     /// # Errors
