@@ -4,6 +4,7 @@
 //! checkpoints.
 
 mod composed;
+mod fused;
 mod gemm;
 mod nearest;
 
@@ -12,10 +13,38 @@ pub use nearest::nearest;
 use burn::tensor::{Int, Tensor, TensorData};
 
 use super::Segments;
+use fused::Fused;
+
+/// An input that an operation does not have.
+const NONE: Option<Tensor<1>> = None;
+
+fn check_segments(segments: &Segments, queries: &Tensor<2>, keys: &Tensor<2>) {
+    assert_eq!(
+        segments.queries(),
+        queries.dims()[0],
+        "segments are made for as many queries"
+    );
+    assert_eq!(
+        segments.keys(),
+        keys.dims()[0],
+        "segments are made for as many keys"
+    );
+}
+
+fn check_targets(targets: &[u32], [rows, classes]: [usize; 2]) {
+    assert_eq!(targets.len(), rows, "one target per row");
+    assert!(
+        targets.iter().all(|target| (*target as usize) < classes),
+        "targets are classes"
+    );
+}
 
 /// `x W^T + b`; `x` is `[N, in]`, `weight` `[out, in]`.
 #[must_use]
 pub fn linear(x: Tensor<2>, weight: Tensor<2>, bias: Option<Tensor<1>>) -> Tensor<2> {
+    if fused::takes(&x) {
+        return fused::run(Fused::Linear, x, Some(weight), bias);
+    }
     composed::linear(x, weight, bias)
 }
 
@@ -27,6 +56,10 @@ pub fn layer_norm(
     bias: Option<Tensor<1>>,
     epsilon: f64,
 ) -> Tensor<2> {
+    if fused::takes(&x) {
+        let epsilon = epsilon as f32;
+        return fused::run(Fused::LayerNorm { epsilon }, x, Some(weight), bias);
+    }
     composed::layer_norm(x, weight, bias, epsilon)
 }
 
@@ -34,6 +67,11 @@ pub fn layer_norm(
 /// `(D / heads)^-0.5`. Gives `[N, D]`, `[heads][D / heads]`.
 #[must_use]
 pub fn self_attention(qkv: Tensor<2>, heads: usize, segments: &Segments) -> Tensor<2> {
+    check_segments(segments, &qkv, &qkv);
+    if fused::takes(&qkv) {
+        let segments = segments.clone();
+        return fused::run(Fused::Attention { heads, segments }, qkv, NONE, NONE);
+    }
     composed::self_attention(qkv, heads, segments)
 }
 
@@ -46,31 +84,53 @@ pub fn cross_attention(
     heads: usize,
     segments: &Segments,
 ) -> Tensor<2> {
+    check_segments(segments, &q, &kv);
+    // Without any key there is no gradient to hand back; the composed form gives the zeros.
+    if fused::takes(&q) && segments.keys() > 0 {
+        let segments = segments.clone();
+        return fused::run(Fused::Attention { heads, segments }, q, Some(kv), NONE);
+    }
     composed::cross_attention(q, kv, heads, segments)
 }
 
 /// `x Phi(x)` with the exact (erf) normal distribution function.
 #[must_use]
 pub fn gelu<const D: usize>(x: Tensor<D>) -> Tensor<D> {
+    if fused::takes(&x) {
+        return fused::run(Fused::Gelu, x, NONE, NONE);
+    }
     burn::tensor::activation::gelu(x)
 }
 
 /// `silu(gate) * value`, element by element.
 #[must_use]
 pub fn swiglu(gate: Tensor<2>, value: Tensor<2>) -> Tensor<2> {
+    if fused::takes(&gate) {
+        return fused::run(Fused::SwiGlu, gate, Some(value), NONE);
+    }
     burn::tensor::activation::silu(gate) * value
 }
 
 /// `-log softmax(logits)[target]` of each row: `[N]`. `logits` is `[N, V]`.
 #[must_use]
 pub fn cross_entropy(logits: Tensor<2>, targets: &[u32]) -> Tensor<1> {
+    check_targets(targets, logits.dims());
+    if fused::takes(&logits) {
+        let targets = targets.into();
+        return fused::run(Fused::CrossEntropy { targets }, logits, NONE, NONE);
+    }
     composed::cross_entropy(logits, targets)
 }
 
 /// [`cross_entropy`] of the logits `x table^T`, without keeping all of them: `x` is `[N, D]`, `table` `[V, D]`. Gives `[N]`.
 #[must_use]
 pub fn tied_cross_entropy(x: Tensor<2>, table: Tensor<2>, targets: &[u32]) -> Tensor<1> {
-    cross_entropy(linear(x, table, None), targets)
+    check_targets(targets, [x.dims()[0], table.dims()[0]]);
+    if fused::takes(&x) {
+        let targets = targets.into();
+        return fused::run(Fused::TiedCrossEntropy { targets }, x, Some(table), NONE);
+    }
+    composed::cross_entropy(composed::linear(x, table, None), targets)
 }
 
 /// The rows `ids` of `table` `[V, D]`: `[N, D]`.
@@ -94,6 +154,9 @@ pub fn indices(ids: &[u32], like: &Tensor<2>) -> Tensor<1, Int> {
 /// The sum of squares of all elements.
 #[must_use]
 pub fn sum_of_squares(x: Tensor<1>) -> f64 {
+    if fused::takes(&x) {
+        return fused::sum_of_squares(x.without_autodiff());
+    }
     composed::sum_of_squares(x)
 }
 
@@ -121,5 +184,8 @@ pub fn adamw(
     square: Tensor<1>,
     step: AdamWStep,
 ) -> (Tensor<1>, Tensor<1>, Tensor<1>) {
+    if fused::takes(&values) {
+        return fused::adamw(values, gradient, mean, square, step);
+    }
     composed::adamw(values, gradient, mean, square, step)
 }

@@ -1,0 +1,117 @@
+//! GELU and SwiGLU, element by element; backward recomputes from the inputs.
+// Vector instructions reach only what is inlined.
+#![allow(clippy::inline_always)]
+
+use rayon::prelude::*;
+
+use super::{Array, Kernel, Saved, vector};
+
+/// Elements per task.
+const ELEMENTS: usize = 8192;
+
+/// `y[i] = f(i-th values of the inputs)` for all elements, in parallel.
+fn map<const N: usize>(inputs: [&[f32]; N], f: impl Fn([f32; N]) -> f32 + Sync) -> Vec<f32> {
+    let length = inputs[0].len();
+    let mut y = vec![0.0; length];
+    y.par_chunks_mut(ELEMENTS)
+        .enumerate()
+        .for_each(|(task, y)| {
+            let start = task * ELEMENTS;
+            let inputs = inputs.map(|x| &x[start..start + y.len()]);
+            vector::vectorised(
+                #[inline(always)]
+                || {
+                    for (i, y) in y.iter_mut().enumerate() {
+                        *y = f(inputs.map(|x| x[i]));
+                    }
+                },
+            );
+        });
+    y
+}
+
+/// `x Phi(x)`.
+#[derive(Debug)]
+pub struct Gelu;
+
+/// The normal distribution function.
+#[inline(always)]
+fn phi(x: f32) -> f32 {
+    0.5 * (1.0 + vector::erf(x * std::f32::consts::FRAC_1_SQRT_2))
+}
+
+impl Kernel for Gelu {
+    fn forward(&self, [x, _, _]: [&Array; 3]) -> (Array, Saved) {
+        let y = map(
+            [x.values()],
+            #[inline(always)]
+            |[x]| x * phi(x),
+        );
+        (Array::new(y, &x.shape()), Saved::default())
+    }
+
+    fn backward(
+        &self,
+        [x, _, _]: [&Array; 3],
+        _: &Saved,
+        dy: &Array,
+        _: [bool; 3],
+    ) -> [Option<Array>; 3] {
+        /// `1 / sqrt(2 pi)`.
+        const DENSITY: f32 = 0.398_942_3;
+        let dx = map(
+            [x.values(), dy.values()],
+            #[inline(always)]
+            |[x, dy]| dy * (phi(x) + x * DENSITY * vector::exp(-0.5 * x * x)),
+        );
+        [Some(Array::new(dx, &x.shape())), None, None]
+    }
+}
+
+/// `silu(gate) * value`.
+#[derive(Debug)]
+pub struct SwiGlu;
+
+#[inline(always)]
+fn sigmoid(x: f32) -> f32 {
+    1.0 / (1.0 + vector::exp(-x))
+}
+
+impl Kernel for SwiGlu {
+    fn forward(&self, [gate, value, _]: [&Array; 3]) -> (Array, Saved) {
+        let y = map(
+            [gate.values(), value.values()],
+            #[inline(always)]
+            |[gate, value]| gate * sigmoid(gate) * value,
+        );
+        (Array::new(y, &gate.shape()), Saved::default())
+    }
+
+    fn backward(
+        &self,
+        [gate, value, _]: [&Array; 3],
+        _: &Saved,
+        dy: &Array,
+        _: [bool; 3],
+    ) -> [Option<Array>; 3] {
+        let dgate = map(
+            [gate.values(), value.values(), dy.values()],
+            #[inline(always)]
+            |[gate, value, dy]| {
+                let s = sigmoid(gate);
+                dy * value * s * (1.0 + gate * (1.0 - s))
+            },
+        );
+        let dvalue = map(
+            [gate.values(), dy.values()],
+            #[inline(always)]
+            |[gate, dy]| dy * gate * sigmoid(gate),
+        );
+        let shape = gate.shape();
+        [
+            Some(Array::new(dgate, &shape)),
+            Some(Array::new(dvalue, &shape)),
+            None,
+        ]
+    }
+}
