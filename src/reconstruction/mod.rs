@@ -8,7 +8,9 @@
 pub mod cloud;
 pub mod depth;
 pub mod export;
+pub mod folder;
 pub mod predictions;
 pub mod scale;
+pub mod spool;
 pub mod stitch;
 pub mod windows;

@@ -4,6 +4,7 @@
 mod metrics;
 mod parity;
 mod recordings_video;
+mod reconstruction;
 mod shared;
 mod trajectories;
 

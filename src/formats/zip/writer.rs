@@ -1,7 +1,7 @@
 //! Writing zip archives: members stored, no times, so that equal content gives equal bytes.
 
 use super::FormatError;
-use std::io::Write;
+use std::io::{Read, Seek, SeekFrom, Write};
 
 /// Writes an archive member by member. Members start at multiples of 64 bytes, so that arrays can be mapped in place.
 #[derive(Debug)]
@@ -32,6 +32,42 @@ impl<W: Write> ZipWriter<W> {
     /// # Errors
     /// When the name was used before, or archive or member reach 4 GB (zip64 is read, but not written).
     pub fn add(&mut self, name: &str, bytes: &[u8]) -> Result<(), FormatError> {
+        let mut crc = flate2::Crc::new();
+        crc.update(bytes);
+        self.begin(name, bytes.len() as u64, crc.sum())?;
+        self.out.write_all(bytes)?;
+        Ok(())
+    }
+
+    /// Adds a member from a file that need not fit in memory; it is read twice.
+    ///
+    /// # Errors
+    /// As [`ZipWriter::add`], and when reading fails or the file changes in between.
+    pub fn add_file(&mut self, name: &str, file: &mut std::fs::File) -> Result<(), FormatError> {
+        let mut buffer = vec![0; 1 << 16];
+        let mut crc = flate2::Crc::new();
+        let mut length = 0;
+        file.seek(SeekFrom::Start(0))?;
+        loop {
+            let n = file.read(&mut buffer)?;
+            if n == 0 {
+                break;
+            }
+            crc.update(&buffer[..n]);
+            length += n as u64;
+        }
+        self.begin(name, length, crc.sum())?;
+        file.seek(SeekFrom::Start(0))?;
+        let copied = std::io::copy(&mut file.take(length), &mut self.out)?;
+        if copied != length {
+            let reason = format!("member `{name}`: the file became shorter while it was copied");
+            return Err(super::malformed(copied, reason));
+        }
+        Ok(())
+    }
+
+    /// Writes the header of a member whose `length` bytes follow, and remembers it for the directory.
+    fn begin(&mut self, name: &str, length: u64, crc: u32) -> Result<(), FormatError> {
         let refuse = |reason: &str| Err(super::malformed(0, format!("member `{name}`: {reason}")));
         if !self.names.insert(name.to_owned()) {
             return refuse("there is one of this name already");
@@ -45,18 +81,16 @@ impl<W: Write> ZipWriter<W> {
         if (1..4).contains(&padding) {
             padding += ALIGNMENT;
         }
-        let end = header_end + padding + bytes.len() as u64;
+        let end = header_end + padding + length;
         if end + self.directory.len() as u64 + 8192 > u64::from(u32::MAX) {
             return refuse("the archive would exceed 4 GB");
         }
-        let mut crc = flate2::Crc::new();
-        crc.update(bytes);
 
         let mut common = Vec::with_capacity(26);
         for field in [20, if name.is_ascii() { 0 } else { 0x800 }, 0, 0, DATE] {
             common.extend(u16::to_le_bytes(field));
         }
-        for field in [crc.sum(), bytes.len() as u32, bytes.len() as u32] {
+        for field in [crc, length as u32, length as u32] {
             common.extend(field.to_le_bytes());
         }
         common.extend((name.len() as u16).to_le_bytes());
@@ -71,7 +105,6 @@ impl<W: Write> ZipWriter<W> {
             header.resize(30 + name.len() + padding as usize, 0);
         }
         self.out.write_all(&header)?;
-        self.out.write_all(bytes)?;
 
         self.directory.extend(b"PK\x01\x02\x14\x00");
         self.directory.extend(&common);

@@ -3,34 +3,17 @@
 use crate::formats::FormatError;
 use crate::formats::npy::NpyArray;
 use crate::formats::npz::Npz;
+use crate::reconstruction::predictions::ScaleStatus;
 use serde::{Deserialize, Serialize};
 use std::path::Path;
 
-/// Whether lengths are metres, and why.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Scale {
-    /// Metres as the tokenizer was trained on: camera, body, hands.
-    Learned,
-    /// Metres by the fit of the depth to the floor under the wearer's feet.
-    MetricByFloor,
-    /// Metres by the fit to a metric depth of another model.
-    MetricByAnchor,
-    /// Up to an unknown scale and shift.
-    Relative,
-    /// Has no length.
-    None,
-}
-
-impl Scale {
+impl ScaleStatus {
     /// In words, for people.
-    pub fn words(&self) -> &'static str {
+    pub fn words(&self) -> String {
         match self {
-            Self::Learned => "metres as learned",
-            Self::MetricByFloor => "metric by floor fit",
-            Self::MetricByAnchor => "metric by anchor depth",
-            Self::Relative => "relative",
-            Self::None => "no length",
+            Self::Metric { by } => format!("metric by {by}"),
+            Self::Relative => "relative".into(),
+            Self::None => "no length".into(),
         }
     }
 }
@@ -43,28 +26,30 @@ pub struct ArrayFacts {
     /// Name within the file.
     pub name: String,
     pub shape: Vec<usize>,
-    /// In words: `m`, `rad`, `image width and height`.
+    /// In words: `m`, `image width and height`.
     pub unit: String,
     /// In words: `world (z up, origin at the first camera)`.
     pub frame: String,
     /// Hz; `None` for arrays without time.
     pub rate: Option<f64>,
-    pub scale: Scale,
-    /// The array of the same file that says which entries are known; `None` means all are.
+    pub scale: ScaleStatus,
+    /// The array of the same file that says which entries are known; `None` means unknown entries are NaN.
     pub validity: Option<String>,
 }
 
 /// Arrays of one file and what they are.
 #[derive(Debug, Clone, Default)]
 pub struct ArrayFile {
-    pub arrays: Npz,
-    pub facts: Vec<ArrayFacts>,
+    arrays: Npz,
+    facts: Vec<ArrayFacts>,
 }
 
 impl ArrayFile {
-    /// Adds an array with its facts; `file` of the facts is filled in when the file is written.
+    /// Adds an array with its facts; `file` and `shape` of the facts are filled in here and when the file is written.
     #[must_use]
-    pub fn with(mut self, array: impl Into<NpyArray>, facts: ArrayFacts) -> Self {
+    pub fn with(mut self, array: impl Into<NpyArray>, mut facts: ArrayFacts) -> Self {
+        let array = array.into();
+        facts.shape.clone_from(&array.shape);
         self.arrays = self.arrays.with(&facts.name, array);
         self.facts.push(facts);
         self
