@@ -3,8 +3,8 @@
 
 mod metrics;
 mod parity;
-mod recordings_video;
 mod reconstruction;
+mod recordings_video;
 mod shared;
 mod trajectories;
 
