@@ -3,6 +3,7 @@
 pub mod normaliser;
 pub mod patches;
 pub mod quantizer;
+pub mod trained;
 pub mod vq;
 
 use crate::clip::Signal;

@@ -2,6 +2,7 @@
 
 pub mod optimizer;
 pub mod schedule;
+pub mod tokenizer;
 
 pub use optimizer::{AdamW, AdamWSettings};
 pub use schedule::Schedule;
