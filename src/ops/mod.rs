@@ -1,1 +1,5 @@
 //! The ops of the experiment language: one file per op, with its settings, its ports and what it runs.
+
+pub mod tokenizer_entry;
+
+pub use tokenizer_entry::TokenizerEntry;

@@ -1,6 +1,7 @@
 //! One integration test binary, a file per command or promise.
 #![allow(clippy::unwrap_used)] // A test that cannot go on should stop where it is.
 
+mod egom2p_examples;
 mod metrics;
 mod parity;
 mod reconstruction;

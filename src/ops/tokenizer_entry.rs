@@ -1,0 +1,82 @@
+//! What `registry/tokenizer/*.yaml` hold: the settings of one family of tokenizers.
+
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use crate::experiment::{Kind, KindEntry};
+use crate::tokenizer::vq::VqSettings;
+
+/// A tokenizer before it is trained, by family.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(tag = "family", rename_all = "snake_case")]
+pub enum TokenizerEntry {
+    /// VQ-VAE of signals or joints over time.
+    Vq(VqSettings),
+}
+
+impl Default for TokenizerEntry {
+    fn default() -> Self {
+        Self::Vq(VqSettings::default())
+    }
+}
+
+impl Kind for TokenizerEntry {
+    const KIND: &'static str = "tokenizer";
+    const ABOUT: &'static str =
+        "How a modality becomes tokens: sizes, codebook, compression, loss.";
+}
+inventory::submit! { KindEntry::of::<TokenizerEntry>() }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::modality::Shape;
+    use serde_json::Value;
+
+    fn entry(name: &str) -> VqSettings {
+        let path = format!(
+            "{}/registry/tokenizer/{name}.yaml",
+            env!("CARGO_MANIFEST_DIR")
+        );
+        let text = std::fs::read_to_string(path).unwrap();
+        let mut value: Value = serde_saphyr::from_str(&text).unwrap();
+        let map = value.as_object_mut().unwrap();
+        assert_eq!(map.remove("tokenizer").unwrap(), name);
+        assert!(map.remove("about").unwrap().is_string());
+        let TokenizerEntry::Vq(settings) = serde_json::from_value(value).unwrap();
+        settings
+    }
+
+    #[test]
+    fn every_shipped_entry_fits_the_signals_it_is_for() {
+        let temporal = |channels| Shape::Temporal {
+            samples: 60,
+            channels,
+        };
+        let joints = Shape::Kinematic {
+            samples: 60,
+            joints: 21,
+        };
+        for (name, shape, codebook, grid) in [
+            ("vq_camera", temporal(9), 256, vec![30]),
+            ("vq_gaze", temporal(2), 512, vec![30]),
+            ("vq_hand", joints.clone(), 1024, vec![30, 7]),
+            ("vq_body", joints.clone(), 2048, vec![30, 7]),
+            ("vq_temporal_small", temporal(6), 128, vec![30]),
+            ("vq_kinematic_small", joints, 256, vec![30, 7]),
+        ] {
+            let settings = entry(name);
+            assert_eq!(settings.codebook, codebook, "{name}");
+            assert_eq!(settings.patches(&shape).unwrap().grid(), grid, "{name}");
+        }
+    }
+
+    #[test]
+    fn an_unknown_key_of_an_entry_is_refused() {
+        let value = serde_json::json!({"family": "vq", "code_book": 3});
+        let message = serde_json::from_value::<TokenizerEntry>(value)
+            .unwrap_err()
+            .to_string();
+        assert!(message.contains("code_book"), "{message}");
+    }
+}
