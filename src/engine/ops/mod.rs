@@ -4,10 +4,14 @@
 //! checkpoints.
 
 mod composed;
+mod convolution;
+mod frame_norm;
 mod fused;
 mod gemm;
 mod nearest;
 
+pub use convolution::{Taps, convolve};
+pub use frame_norm::frame_norm;
 pub use nearest::nearest;
 
 use burn::tensor::{Int, Tensor, TensorData};
