@@ -4,6 +4,7 @@ pub mod normaliser;
 pub mod patches;
 pub mod quantizer;
 pub mod trained;
+pub mod video;
 pub mod vq;
 
 use crate::clip::Signal;

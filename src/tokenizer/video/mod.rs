@@ -1,0 +1,20 @@
+//! The discrete video tokenizer (Cosmos, DV4x8x8 and DV8x16x16, and any smaller one): Haar wavelet, causal factorised
+//! convolutions, finite scalar quantisation (Sec. 4.2, Supp. A; frozen in the paper, trainable here).
+//!
+//! Read in this order: [`settings`] (sizes, and from them every layer), [`haar`] (pixels to wavelet coefficients and back),
+//! [`layers`] (convolution, norm, residual block, attention, resampling), [`network`] (encoder and decoder, parameters named as
+//! in NVIDIA's files), [`fsq`] (latents to tokens), [`padding`] (clips to the lengths and sizes the network takes) and
+//! [`tokenizer`] (signals to tokens and back, and one training step).
+
+pub mod fsq;
+pub mod haar;
+pub mod layers;
+pub mod network;
+pub mod padding;
+pub mod settings;
+pub mod tokenizer;
+
+pub use fsq::Fsq;
+pub use network::Network;
+pub use settings::VideoSettings;
+pub use tokenizer::{VideoTokenizer, psnr};

@@ -1,0 +1,436 @@
+//! Video signals to tokens and back, and the loss of one training step.
+
+use burn::tensor::{Tensor, TensorData};
+use ndarray::{ArrayD, IxDyn};
+
+use super::layers::Extent;
+use super::padding::Padding;
+use super::settings::COLOURS;
+use super::{Fsq, Network, VideoSettings, haar};
+use crate::clip::Signal;
+use crate::engine::ops;
+use crate::engine::parameters::to_host;
+use crate::tokenizer::{TokenGrid, Tokenizer, TokenizerError};
+
+/// A network with the modality and clip size it works on. Signals are `[frames, height, width, 3]` in [-1, 1].
+#[derive(Debug, Clone)]
+pub struct VideoTokenizer {
+    network: Network,
+    fsq: Fsq,
+    modality: String,
+    padding: Padding,
+    grid: Vec<usize>,
+    /// Pixels of a block to coefficients, and back.
+    haar: [Tensor<2>; 2],
+}
+
+/// What one training forward pass gives.
+#[derive(Debug)]
+pub struct Trained {
+    /// Mean squared error of all pixels, `[1]`: what to minimise.
+    pub loss: Tensor<1>,
+    /// The tokens the batch went through.
+    pub tokens: Vec<u32>,
+}
+
+impl VideoTokenizer {
+    /// A tokenizer of `modality` for clips of `[frames, height, width]`.
+    ///
+    /// # Errors
+    /// When the clip is empty.
+    pub fn new(
+        modality: &str,
+        clip: [usize; 3],
+        network: Network,
+        compute: &crate::engine::Compute,
+    ) -> Result<Self, TokenizerError> {
+        if clip.contains(&0) || clip.iter().any(|n| *n > 1 << 14) {
+            return Err(TokenizerError::Other(format!(
+                "{modality}: a clip of {clip:?} frames, height, width"
+            )));
+        }
+        let settings = network.settings();
+        let padding = Padding::of(clip, settings.temporal, settings.spatial);
+        let side = settings.coefficients();
+        let forward = haar::block_matrix(settings.patch, COLOURS);
+        let scale = settings.patch.pow(3) as f32;
+        let mut inverse = vec![0.0; forward.len()];
+        for row in 0..side {
+            for column in 0..side {
+                inverse[column * side + row] = forward[row * side + column] * scale;
+            }
+        }
+        let matrix = |values: Vec<f32>| {
+            Tensor::from_data(TensorData::new(values, [side, side]), compute.device())
+        };
+        Ok(Self {
+            fsq: Fsq::new(&settings.levels),
+            modality: modality.to_owned(),
+            grid: settings.grid(padding.padded).to_vec(),
+            padding,
+            haar: [matrix(forward), matrix(inverse)],
+            network,
+        })
+    }
+
+    #[must_use]
+    pub fn network(&self) -> &Network {
+        &self.network
+    }
+
+    /// For training and loading.
+    pub fn network_mut(&mut self) -> &mut Network {
+        &mut self.network
+    }
+
+    #[must_use]
+    pub fn settings(&self) -> &VideoSettings {
+        self.network.settings()
+    }
+
+    /// Frames, height and width of the clips.
+    #[must_use]
+    pub fn clip(&self) -> [usize; 3] {
+        self.padding.clip
+    }
+
+    fn size(&self) -> [usize; 4] {
+        let [frames, height, width] = self.padding.padded;
+        [frames, height, width, COLOURS]
+    }
+
+    /// Where the rows of `samples` clips lie after the wavelet.
+    fn extent(&self, samples: usize) -> Extent {
+        let (patch, [frames, height, width]) = (self.settings().patch, self.padding.padded);
+        Extent {
+            samples,
+            frames: frames.div_ceil(patch),
+            height: height / patch,
+            width: width / patch,
+        }
+    }
+
+    /// Where the rows of `samples` token grids lie.
+    fn token_extent(&self, samples: usize) -> Extent {
+        Extent {
+            samples,
+            frames: self.grid[0],
+            height: self.grid[1],
+            width: self.grid[2],
+        }
+    }
+
+    /// Blocks of pixels of clips `[frames, height, width, 3]`: `[N, patch^3 * 3]`.
+    fn blocks(&self, clips: &[&[f32]]) -> Tensor<2> {
+        let mut values = Vec::new();
+        for clip in clips {
+            let padded = self.padding.pad(clip, COLOURS);
+            values.extend(haar::cut(&padded, self.size(), self.settings().patch));
+        }
+        let side = self.settings().coefficients();
+        let rows = values.len() / side;
+        let device = self.haar[0].device();
+        Tensor::from_data(TensorData::new(values, [rows, side]), &device)
+    }
+
+    /// Latents `[N', code width]` before quantisation.
+    fn latents(&self, blocks: Tensor<2>, samples: usize) -> Tensor<2> {
+        let coefficients = ops::linear(blocks, self.haar[0].clone(), None);
+        self.network.encode(coefficients, self.extent(samples)).0
+    }
+
+    /// Blocks of pixels `[N, patch^3 * 3]` of codes `[N', code width]`.
+    fn pixels(&self, codes: Tensor<2>, samples: usize) -> Tensor<2> {
+        let (coefficients, _) = self.network.decode(codes, self.token_extent(samples));
+        ops::linear(coefficients, self.haar[1].clone(), None)
+    }
+
+    /// The forward pass of one training step over clips `[frames, height, width, 3]`, gradients passing straight through the
+    /// rounding.
+    ///
+    /// # Errors
+    /// When a clip has another size or holds a value that is not finite.
+    pub fn train(&self, clips: &[Signal]) -> Result<Trained, TokenizerError> {
+        let values = self.checked(clips)?;
+        let samples = clips.len();
+        let slices: Vec<&[f32]> = values.iter().map(Vec::as_slice).collect();
+        let blocks = self.blocks(&slices);
+        let bounded = self.bound(self.latents(blocks.clone(), samples));
+        let host = to_host(bounded.clone());
+        let tokens = self.fsq.index(&host);
+        let width = self.fsq.width();
+        let device = self.haar[0].device();
+        let codes = Tensor::from_data(
+            TensorData::new(self.fsq.decode(&tokens), [tokens.len(), width]),
+            &device,
+        );
+        let soft = bounded / self.row(|levels| (levels / 2) as f64);
+        let offset: Tensor<2> = codes - soft.clone().without_autodiff();
+        let found = self.pixels(soft + offset, samples);
+        let kept = self.kept(samples);
+        let count = kept.clone().sum().into_scalar::<f32>() as f64;
+        let loss = ((found - blocks).square() * kept).sum() / count;
+        Ok(Trained { loss, tokens })
+    }
+
+    /// `[1, width]` of a function of each dimension's levels.
+    fn row(&self, value: impl Fn(usize) -> f64) -> Tensor<2> {
+        let values: Vec<f32> = self
+            .settings()
+            .levels
+            .iter()
+            .map(|l| value(*l) as f32)
+            .collect();
+        let width = values.len();
+        Tensor::from_data(TensorData::new(values, [1, width]), &self.haar[0].device())
+    }
+
+    /// The squashed latents, differentiable.
+    fn bound(&self, z: Tensor<2>) -> Tensor<2> {
+        let squash: Vec<[f64; 3]> = (0..self.fsq.width()).map(|i| self.fsq.squash(i)).collect();
+        let part = |k: usize| {
+            let values: Vec<f32> = squash.iter().map(|s| s[k] as f32).collect();
+            Tensor::<2>::from_data(
+                TensorData::new(values, [1, squash.len()]),
+                &self.haar[0].device(),
+            )
+        };
+        (z + part(2)).tanh() * part(0) - part(1)
+    }
+
+    /// 1 where a value of a block stands for a pixel, 0 where it repeats the first frame.
+    fn kept(&self, samples: usize) -> Tensor<2> {
+        let extent = self.extent(samples);
+        let (patch, side) = (self.settings().patch, self.settings().coefficients());
+        let repeated = (patch - 1) * side / patch;
+        let mut values = Vec::with_capacity(extent.rows() * side);
+        for row in 0..extent.rows() {
+            let first = (row / extent.pixels()).is_multiple_of(extent.frames);
+            values.extend((0..side).map(|i| f32::from(u8::from(!first || i >= repeated))));
+        }
+        Tensor::from_data(
+            TensorData::new(values, [extent.rows(), side]),
+            &self.haar[0].device(),
+        )
+    }
+
+    /// The values of signals, row-major, checked for shape and finiteness.
+    fn checked(&self, signals: &[Signal]) -> Result<Vec<Vec<f32>>, TokenizerError> {
+        let [frames, height, width] = self.padding.clip;
+        let expected = vec![frames, height, width, COLOURS];
+        let mut all = Vec::with_capacity(signals.len());
+        for (index, signal) in signals.iter().enumerate() {
+            if signal.values.shape() != expected {
+                return Err(TokenizerError::Shape {
+                    modality: self.modality.clone(),
+                    index,
+                    found: signal.values.shape().to_vec(),
+                    expected,
+                });
+            }
+            let mut values: Vec<f32> = signal.values.iter().copied().collect();
+            if let Some(valid) = &signal.valid {
+                if valid.shape() != &expected[..3] {
+                    return Err(TokenizerError::Shape {
+                        modality: self.modality.clone(),
+                        index,
+                        found: valid.shape().to_vec(),
+                        expected: expected[..3].to_vec(),
+                    });
+                }
+                for (pixel, valid) in values.chunks_exact_mut(COLOURS).zip(valid) {
+                    if !valid {
+                        pixel.fill(0.0);
+                    }
+                }
+            }
+            if let Some(at) = values.iter().position(|v| !v.is_finite()) {
+                let pixel = at / COLOURS;
+                return Err(TokenizerError::NotFinite {
+                    modality: self.modality.clone(),
+                    index,
+                    position: vec![
+                        pixel / (height * width),
+                        pixel / width % height,
+                        pixel % width,
+                        at % COLOURS,
+                    ],
+                });
+            }
+            all.push(values);
+        }
+        Ok(all)
+    }
+}
+
+impl Tokenizer for VideoTokenizer {
+    fn modality(&self) -> &str {
+        &self.modality
+    }
+
+    fn grid(&self) -> &[usize] {
+        &self.grid
+    }
+
+    fn vocabulary(&self) -> usize {
+        self.settings().vocabulary()
+    }
+
+    /// One clip at a time: memory does not grow with the batch.
+    fn encode(&self, signals: &[Signal]) -> Result<Vec<TokenGrid>, TokenizerError> {
+        let clips = self.checked(signals)?;
+        Ok(clips
+            .iter()
+            .map(|clip| TokenGrid {
+                ids: self
+                    .fsq
+                    .encode(&to_host(self.latents(self.blocks(&[clip]), 1))),
+                grid: self.grid.clone(),
+            })
+            .collect())
+    }
+
+    fn decode(&self, tokens: &[TokenGrid]) -> Result<Vec<Signal>, TokenizerError> {
+        let vocabulary = self.vocabulary();
+        for (index, grid) in tokens.iter().enumerate() {
+            let count: usize = self.grid.iter().product();
+            if grid.grid != self.grid || grid.ids.len() != count {
+                return Err(TokenizerError::Shape {
+                    modality: self.modality.clone(),
+                    index,
+                    found: grid.grid.clone(),
+                    expected: self.grid.clone(),
+                });
+            }
+            if let Some(token) = grid.ids.iter().find(|id| **id as usize >= vocabulary) {
+                return Err(TokenizerError::Vocabulary {
+                    modality: self.modality.clone(),
+                    index,
+                    token: *token,
+                    vocabulary,
+                });
+            }
+        }
+        let device = self.haar[0].device();
+        tokens
+            .iter()
+            .map(|grid| {
+                let codes = self.fsq.decode(&grid.ids);
+                let shape = [grid.ids.len(), self.fsq.width()];
+                let codes = Tensor::from_data(TensorData::new(codes, shape), &device);
+                let blocks = to_host(self.pixels(codes, 1));
+                let padded = haar::paste(&blocks, self.size(), self.settings().patch);
+                let mut values = self.padding.crop(&padded, COLOURS);
+                for value in &mut values {
+                    *value = value.clamp(-1.0, 1.0);
+                }
+                let [frames, height, width] = self.padding.clip;
+                let shape = IxDyn(&[frames, height, width, COLOURS]);
+                let values = ArrayD::from_shape_vec(shape, values)
+                    .map_err(|e| TokenizerError::Other(e.to_string()))?;
+                Ok(Signal {
+                    values,
+                    valid: None,
+                })
+            })
+            .collect()
+    }
+}
+
+/// Peak signal-to-noise ratio in dB of values in [-1, 1]; infinite for equal videos.
+///
+/// # Panics
+/// When the videos have different sizes.
+#[must_use]
+pub fn psnr(found: &[f32], expected: &[f32]) -> f64 {
+    assert_eq!(found.len(), expected.len());
+    let square: f64 = found
+        .iter()
+        .zip(expected)
+        .map(|(a, b)| f64::from(a - b).powi(2))
+        .sum();
+    10.0 * (4.0 * found.len() as f64 / square).log10()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::engine::{Compute, Gradients, Initialise, Parameters};
+    use crate::training::{AdamW, AdamWSettings};
+
+    fn tiny(seed: u64) -> VideoTokenizer {
+        let settings = VideoSettings {
+            channels: 8,
+            multipliers: vec![1, 2],
+            blocks: 1,
+            latent_channels: 6,
+            levels: vec![8, 5, 5],
+            ..VideoSettings::default()
+        };
+        let compute = Compute::cpu();
+        let network = Network::new(&Initialise::new(&compute, seed), &settings).unwrap();
+        VideoTokenizer::new("rgb", [8, 16, 24], network, &compute).unwrap()
+    }
+
+    /// A bright square that moves over a gradient.
+    fn clip(phase: usize) -> Signal {
+        let values = ArrayD::from_shape_fn(IxDyn(&[8, 16, 24, 3]), |at| {
+            let inside =
+                (at[1] + 4).abs_diff(8 + phase) < 4 && at[2].abs_diff(4 + at[0] + phase) < 4;
+            if inside {
+                0.9 - 0.4 * at[3] as f32
+            } else {
+                at[2] as f32 / 24.0 - 0.5
+            }
+        });
+        Signal {
+            values,
+            valid: None,
+        }
+    }
+
+    #[test]
+    fn shapes_and_bad_signals_are_handled() {
+        let tokenizer = tiny(0);
+        assert_eq!(tokenizer.grid(), [3, 2, 4]);
+        assert_eq!(tokenizer.vocabulary(), 200);
+        let tokens = tokenizer.encode(&[clip(0), clip(1)]).unwrap();
+        assert_eq!(tokens.len(), 2);
+        assert!(tokens[0].ids.iter().all(|id| *id < 200));
+        let back = tokenizer.decode(&tokens).unwrap();
+        assert_eq!(back[1].values.shape(), [8, 16, 24, 3]);
+
+        let mut bad = clip(0);
+        bad.values[[2, 3, 4, 1]] = f32::NAN;
+        let error = tokenizer.encode(&[clip(0), bad]).unwrap_err();
+        assert!(error.to_string().contains("[2, 3, 4, 1]"), "{error}");
+        let mut wrong = tokens[0].clone();
+        wrong.ids[5] = 200;
+        assert!(matches!(
+            tokenizer.decode(&[wrong]),
+            Err(TokenizerError::Vocabulary { token: 200, .. })
+        ));
+    }
+
+    #[test]
+    fn a_few_steps_of_training_bring_the_loss_down_and_are_reproducible() {
+        let run = || {
+            let mut tokenizer = tiny(1);
+            tokenizer.network_mut().start_training();
+            let mut optimizer = AdamW::new(AdamWSettings::default(), tokenizer.network());
+            let mut losses = Vec::new();
+            for _ in 0..12 {
+                let trained = tokenizer.train(&[clip(0), clip(2)]).unwrap();
+                losses.push(trained.loss.clone().into_scalar::<f32>());
+                let gradients = Gradients::of(&trained.loss, tokenizer.network());
+                optimizer
+                    .step(tokenizer.network_mut(), gradients, 3e-3)
+                    .unwrap();
+            }
+            losses
+        };
+        let losses = run();
+        assert!(losses[11] < 0.7 * losses[0], "{losses:?}");
+        assert_eq!(losses, run());
+    }
+}
