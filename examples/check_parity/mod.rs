@@ -3,6 +3,7 @@
 pub mod report;
 pub mod vectors;
 
+mod cosmos;
 mod mask;
 mod mget;
 mod optim;
@@ -21,6 +22,7 @@ type Check = fn(&Path, &mut Report) -> Outcome;
 
 /// The folders that are known, and what compares each.
 const FOLDERS: &[(&str, Check)] = &[
+    ("cosmos", cosmos::check),
     ("mask", mask::check),
     ("mget", mget::check),
     ("optim", optim::check),
