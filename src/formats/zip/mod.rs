@@ -115,32 +115,6 @@ impl<R: Read + Seek> ZipArchive<R> {
         self.stream(&entry)
     }
 
-    /// Fills `buffer` from a *stored* member, starting at `offset` inside it. The CRC is not checked.
-    pub fn read_stored_at(
-        &mut self,
-        name: &str,
-        offset: u64,
-        buffer: &mut [u8],
-    ) -> Result<(), FormatError> {
-        let entry = self.entry(name)?;
-        let end = offset.checked_add(buffer.len() as u64);
-        let start = entry.data_offset + offset.min(entry.size);
-        if entry.method != Method::Stored {
-            return Err(malformed(start, format!("member `{name}` is not stored")));
-        }
-        if end.is_none_or(|end| end > entry.size) {
-            let reason = format!(
-                "{} bytes from {offset} leave member `{name}` of {} bytes",
-                buffer.len(),
-                entry.size
-            );
-            return Err(malformed(start, reason));
-        }
-        self.reader.seek(SeekFrom::Start(start))?;
-        self.reader.read_exact(buffer)?;
-        Ok(())
-    }
-
     fn entry(&self, name: &str) -> Result<&ZipEntry, FormatError> {
         self.find(name)
             .ok_or_else(|| missing(name, self.entries.iter().map(|e| e.name.as_str())))
@@ -148,7 +122,7 @@ impl<R: Read + Seek> ZipArchive<R> {
 
     fn stream(&mut self, entry: &ZipEntry) -> Result<EntryReader<'_>, FormatError> {
         self.reader.seek(SeekFrom::Start(entry.data_offset))?;
-        let raw = (&mut self.reader as &mut dyn Read).take(entry.compressed);
+        let raw = (&mut self.reader as &mut dyn ReadSeek).take(entry.compressed);
         let source = match entry.method {
             Method::Stored => Source::Stored(raw),
             Method::Deflated => Source::Deflated(Box::new(flate2::read::DeflateDecoder::new(raw))),
@@ -157,7 +131,8 @@ impl<R: Read + Seek> ZipArchive<R> {
             source,
             left: entry.size,
             crc: flate2::Crc::new(),
-            expected: entry.crc32,
+            expected: Some(entry.crc32),
+            data_offset: entry.data_offset,
             done: false,
         })
     }
@@ -168,13 +143,18 @@ pub struct EntryReader<'a> {
     source: Source<'a>,
     left: u64,
     crc: flate2::Crc,
-    expected: u32,
+    /// `None` once bytes have been skipped: the checksum cannot be compared then.
+    expected: Option<u32>,
+    data_offset: u64,
     done: bool,
 }
 
+trait ReadSeek: Read + Seek {}
+impl<R: Read + Seek> ReadSeek for R {}
+
 enum Source<'a> {
-    Stored(std::io::Take<&'a mut dyn Read>),
-    Deflated(Box<flate2::read::DeflateDecoder<std::io::Take<&'a mut dyn Read>>>),
+    Stored(std::io::Take<&'a mut dyn ReadSeek>),
+    Deflated(Box<flate2::read::DeflateDecoder<std::io::Take<&'a mut dyn ReadSeek>>>),
 }
 
 impl Read for Source<'_> {
@@ -212,17 +192,35 @@ impl Read for EntryReader<'_> {
 }
 
 impl EntryReader<'_> {
+    /// Moves on by `count` bytes of a stored member without reading them; its checksum is then not compared.
+    pub fn skip_stored(&mut self, count: u64) -> Result<(), FormatError> {
+        let Source::Stored(raw) = &mut self.source else {
+            return Err(malformed(self.data_offset, "the member is not stored"));
+        };
+        if count > self.left {
+            let reason = format!("{count} bytes skipped of {}", self.left);
+            return Err(malformed(self.data_offset, reason));
+        }
+        let limit = raw.limit() - count;
+        raw.get_mut().seek_relative(count as i64)?;
+        raw.set_limit(limit);
+        self.left -= count;
+        self.expected = None;
+        Ok(())
+    }
+
     /// The declared number of bytes has been read: nothing may follow, and the checksum must agree.
     fn finish(&mut self) -> std::io::Result<usize> {
         let invalid = |reason| Err(std::io::Error::new(std::io::ErrorKind::InvalidData, reason));
         if self.source.read(&mut [0])? != 0 {
             return invalid("more data than the directory declares".to_owned());
         }
-        if self.crc.sum() != self.expected {
+        if let Some(expected) = self.expected
+            && self.crc.sum() != expected
+        {
+            let sum = self.crc.sum();
             return invalid(format!(
-                "checksum {:08x}, the directory says {:08x}",
-                self.crc.sum(),
-                self.expected
+                "checksum {sum:08x}, the directory says {expected:08x}"
             ));
         }
         self.done = true;
@@ -321,10 +319,12 @@ mod tests {
         assert_eq!(zip.entries().len(), 2);
         assert_eq!(zip.read("a.txt", 5).unwrap(), b"hello");
         assert_eq!(zip.read("folder/b.bin", 1 << 20).unwrap(), [7; 1000]);
-        let mut middle = [0; 3];
-        zip.read_stored_at("a.txt", 1, &mut middle).unwrap();
-        assert_eq!(&middle, b"ell");
-        assert!(zip.read_stored_at("a.txt", 3, &mut middle).is_err());
+        let mut rest = String::new();
+        let mut reader = zip.reader("a.txt").unwrap();
+        reader.skip_stored(2).unwrap();
+        assert!(reader.skip_stored(4).is_err());
+        reader.read_to_string(&mut rest).unwrap();
+        assert_eq!(rest, "llo");
         assert!(zip.read("a.txt", 4).is_err());
         let missing = zip.read("c", 1).unwrap_err().to_string();
         assert!(missing.contains("a.txt, folder/b.bin"), "{missing}");
