@@ -1,3 +1,53 @@
-//! Reading released weights of others without executing anything.
+//! Weights released by others, read without executing anything and checked before anything is dropped.
+//!
+//! Read in this order: [`pickle`] (an interpreter that can only describe data), [`checkpoint`] (the entries of a `.pth`, a
+//! TorchScript archive or a safetensors file, streamed), [`rules`] (what may happen to an entry), [`mget`], [`vq`] and
+//! [`cosmos`] (which rule applies to which name of which release), [`statistics`] (normalisation files that travel with the
+//! weights) and [`convert`] (the whole import: checks, our files, the manifest).
+//!
+//! Weights are never part of this product: users get them from their authors, under their authors' licences.
 
+pub mod checkpoint;
+pub mod convert;
+pub mod cosmos;
+pub mod mget;
 pub mod pickle;
+pub mod rules;
+pub mod statistics;
+pub mod vq;
+
+pub use checkpoint::{Checkpoint, Entry, Format};
+pub use convert::{ImportOptions, ImportReport, import};
+
+use std::path::{Path, PathBuf};
+
+/// Why a file cannot be imported.
+#[derive(Debug, thiserror::Error)]
+pub enum ImportError {
+    #[error("{}: {reason}", path.display())]
+    Refused { path: PathBuf, reason: String },
+    #[error(transparent)]
+    Format(#[from] crate::formats::FormatError),
+    #[error("{}: {source}", path.display())]
+    Io {
+        path: PathBuf,
+        #[source]
+        source: std::io::Error,
+    },
+}
+
+impl ImportError {
+    pub(crate) fn refused(path: &Path, reason: impl Into<String>) -> Self {
+        Self::Refused {
+            path: path.to_owned(),
+            reason: reason.into(),
+        }
+    }
+
+    pub(crate) fn io(path: &Path) -> impl FnOnce(std::io::Error) -> Self + '_ {
+        move |source| Self::Io {
+            path: path.to_owned(),
+            source,
+        }
+    }
+}

@@ -14,3 +14,6 @@ mod language_ops;
 mod run;
 mod view;
 mod vq_structure;
+
+mod import;
+mod torch;
