@@ -134,8 +134,7 @@ pub fn plan(checkpoint: &Checkpoint, heads: Option<usize>) -> Result<Plan, Strin
                         "decoder",
                         ["self_attn" | "cross_attn", "proj", "weight"]
                         | ["cross_attn", "q", "weight"],
-                    )
-                    | ("decoder", ["cross_attn", "q", "weight"]) => {
+                    ) => {
                         expect(&[width, width])?;
                         keep(&shape)
                     }

@@ -14,6 +14,3 @@ mod language_ops;
 mod run;
 mod view;
 mod vq_structure;
-
-mod import;
-mod torch;

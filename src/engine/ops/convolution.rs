@@ -11,7 +11,7 @@ use burn_autodiff::ops::{Backward, Ops, OpsKind};
 use burn_flex::FlexTensor;
 use rayon::prelude::*;
 
-use super::gemm::{Matrix, gemm, gemm_into};
+use super::gemm::{Matrix, Threads, gemm, gemm_into};
 
 /// Which input rows an output row is computed from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -410,7 +410,15 @@ impl Held {
                     self.taps.gather(x, self.channels, first, &mut columns);
                     let dy = Matrix::rows(&dy[first * outputs..], count, outputs);
                     let columns = Matrix::rows(&columns, count, inner);
-                    gemm_into(&mut sum, inner, dy.transposed(), columns, 1.0, true);
+                    gemm_into(
+                        &mut sum,
+                        inner,
+                        dy.transposed(),
+                        columns,
+                        1.0,
+                        true,
+                        Threads::One,
+                    );
                     first += count;
                 }
                 sum
