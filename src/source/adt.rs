@@ -120,17 +120,23 @@ impl ColourFrames for VrsColour {
         &self.pictures.times
     }
 
-    fn read(&self, indices: &[usize]) -> Result<Vec<Image>, SourceError> {
-        indices
-            .iter()
-            .map(|&index| match self.pictures.read(index)? {
-                Pixels::Rgb(image) => Ok(image),
-                Pixels::Grey16(_) => Err(SourceError::Settings(format!(
-                    "stream {} holds depth, not colour",
-                    self.pictures.stream()
-                ))),
-            })
-            .collect()
+    fn read(
+        &self,
+        indices: &[usize],
+        each: &mut dyn FnMut(usize, Image),
+    ) -> Result<(), SourceError> {
+        for &index in indices {
+            match self.pictures.read(index)? {
+                Pixels::Rgb(image) => each(index, image),
+                Pixels::Grey16(_) => {
+                    return Err(SourceError::Settings(format!(
+                        "stream {} holds depth, not colour",
+                        self.pictures.stream()
+                    )));
+                }
+            }
+        }
+        Ok(())
     }
 }
 

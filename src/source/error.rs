@@ -57,6 +57,9 @@ pub enum SourceError {
         index: usize,
         len: usize,
     },
+    /// An array file that cannot be read.
+    #[error(transparent)]
+    Format(#[from] crate::formats::FormatError),
     /// Settings that contradict each other or the recording.
     #[error("{0}")]
     Settings(String),

@@ -337,8 +337,12 @@ impl ColourFrames for Reclocked {
         &self.times
     }
 
-    fn read(&self, indices: &[usize]) -> Result<Vec<Image>, SourceError> {
-        self.inner.read(indices)
+    fn read(
+        &self,
+        indices: &[usize],
+        each: &mut dyn FnMut(usize, Image),
+    ) -> Result<(), SourceError> {
+        self.inner.read(indices, each)
     }
 }
 

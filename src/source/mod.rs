@@ -4,16 +4,28 @@
 //! this order:
 //!
 //! * [`error`]: what can be wrong with a file, always with the place in it
-//! * [`video`]: mp4, folders of frames, and anything the user's `ffmpeg` can read
-//! * [`aria`]: recordings of Project Aria glasses
+//! * [`video`]: mp4, folders of pictures, and anything the user's `ffmpeg` can read; [`image`]: the resize of every clip
+//! * [`recording`]: how a recording is cut into clips, once for all data sets; [`track`]: signals with clocks of their own
+//! * [`aria`]: recordings of Project Aria glasses; [`umetrack`]: hands from joint angles
+//! * one file per data set: [`adt`], [`hot3d`], [`mps`], [`neutral`] (the folder format that any data set can be written
+//!   as), [`egom2p`] (the ancestors' layout)
+//! * [`dataset`] (many recordings), [`mixture`] (many sources), [`open`] (whatever a path holds), [`convert`] (into shards)
+//!
+//! A further data set is one file that fills a [`recording::Recording`], and one line in [`open::Dataset`].
 
 pub mod adt;
 pub mod aria;
+pub mod convert;
 pub mod csv;
 pub mod dataset;
+pub mod egom2p;
 pub mod error;
 pub mod hot3d;
 pub mod image;
+pub mod mixture;
+pub mod mps;
+pub mod neutral;
+pub mod open;
 pub mod recording;
 mod resize;
 pub mod track;

@@ -23,6 +23,8 @@ use std::sync::{Arc, OnceLock};
 pub const DEPTH_APART: i64 = SECOND / 100;
 /// Gaze outside of this range, in units of the picture, is a failure of the tracker (the ancestors' rule).
 const GAZE_RANGE: std::ops::RangeInclusive<f64> = -0.2..=1.2;
+/// Two frames are equally near when their distances differ by less than clocks are rounded, nanoseconds.
+const TIE: i64 = 2000;
 /// Nanoseconds of a clip.
 const CLIP: i64 = CLIP_SECONDS as i64 * SECOND;
 
@@ -97,11 +99,15 @@ impl CutSettings {
 pub trait ColourFrames: Send + Sync {
     /// Capture times in nanoseconds, ascending.
     fn times(&self) -> &[i64];
-    /// Decodes pictures by ascending, distinct indices.
+    /// Decodes pictures by ascending, distinct indices and hands them to `each` one at a time, with their index.
     ///
     /// # Errors
     /// When one cannot be read.
-    fn read(&self, indices: &[usize]) -> Result<Vec<Image>, SourceError>;
+    fn read(
+        &self,
+        indices: &[usize],
+        each: &mut dyn FnMut(usize, Image),
+    ) -> Result<(), SourceError>;
 }
 
 /// Depth maps on the grid of the colour pictures, not turned.
@@ -140,8 +146,9 @@ pub struct Recording {
     pub device: Option<Track<Isometry3<f64>>>,
     pub up_world: Option<Unit<Vector3<f64>>>,
     pub gaze: Option<Track<GazeSample>>,
-    /// Left and right, in the world.
+    /// Left and right, in `hands_frame`.
     pub hands: [Option<Track<Joints>>; 2],
+    pub hands_frame: JointFrame,
     /// In the world.
     pub body: Option<Track<Joints>>,
     /// The undistortion map, made once.
@@ -157,13 +164,22 @@ impl std::fmt::Debug for Recording {
     }
 }
 
+/// What the coordinates of hands refer to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum JointFrame {
+    #[default]
+    World,
+    /// The upright camera of the same moment.
+    Camera,
+}
+
 /// Where the wearer looks, as the adapter knows it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum GazeSample {
     /// A direction from the central pupil frame of Aria glasses.
     Aria(super::aria::gaze::Gaze, Isometry3<f64>),
-    /// A pixel of the upright picture.
-    Pixel([f64; 2]),
+    /// A pixel of the upright picture, and that picture's width and height.
+    Pixel { pixel: [f64; 2], size: [f64; 2] },
 }
 
 impl super::track::Blend for GazeSample {
@@ -172,8 +188,11 @@ impl super::track::Blend for GazeSample {
             (GazeSample::Aria(a, pose), GazeSample::Aria(b, _)) => {
                 Some(GazeSample::Aria(a.blend(b, weight)?, *pose))
             }
-            (GazeSample::Pixel(a), GazeSample::Pixel(b)) => {
-                Some(GazeSample::Pixel(a.blend(b, weight)?))
+            (GazeSample::Pixel { pixel: a, size }, GazeSample::Pixel { pixel: b, .. }) => {
+                Some(GazeSample::Pixel {
+                    pixel: a.blend(b, weight)?,
+                    size: *size,
+                })
             }
             _ => None,
         }
@@ -199,6 +218,7 @@ impl Recording {
             up_world: None,
             gaze: None,
             hands: [None, None],
+            hands_frame: JointFrame::World,
             body: None,
             remap: OnceLock::new(),
         }
@@ -238,13 +258,14 @@ impl Recording {
     #[must_use]
     pub fn modalities(&self) -> Vec<String> {
         let has_camera = self.device.is_some();
+        let hands = has_camera || self.hands_frame == JointFrame::Camera;
         [
             ("rgb", self.colour.is_some()),
             ("depth", self.depth.is_some()),
             ("camera", has_camera),
             ("gaze", self.gaze.is_some()),
-            ("left_hand", has_camera && self.hands[0].is_some()),
-            ("right_hand", has_camera && self.hands[1].is_some()),
+            ("left_hand", hands && self.hands[0].is_some()),
+            ("right_hand", hands && self.hands[1].is_some()),
             ("body", has_camera && self.body.is_some()),
         ]
         .into_iter()
@@ -292,11 +313,10 @@ impl Recording {
     pub fn gaze_at(&self, time: i64, settings: &CutSettings) -> Option<[f64; 2]> {
         let sample = self.gaze.as_ref()?.at(time)?;
         let (u, v, width, height) = match sample {
-            GazeSample::Pixel([u, v]) => {
-                let camera = &self.mounted(time)?.camera;
-                let (width, height) = self.turn.size(camera.width, camera.height);
-                (u, v, f64::from(width), f64::from(height))
-            }
+            GazeSample::Pixel {
+                pixel: [u, v],
+                size: [width, height],
+            } => (u, v, width, height),
             GazeSample::Aria(gaze, pupils) => {
                 let mounted = self.mounted(time)?;
                 let distance = if settings.gaze_vergence && gaze.depth > 0.0 {
@@ -353,8 +373,15 @@ impl Recording {
             .is_some()
             .then(|| self.gaze_track(&ticks, settings));
         let hands = [0, 1].map(|side| {
-            let joints = self.hands[side].as_ref()?;
-            joints_in_camera(&world_joints(joints, &ticks), camera.as_ref()?).ok()
+            let joints = world_joints(self.hands[side].as_ref()?, &ticks);
+            match self.hands_frame {
+                JointFrame::World => joints_in_camera(&joints, camera.as_ref()?).ok(),
+                JointFrame::Camera => Some(joints_in_frame(
+                    &joints,
+                    SIGNAL_RATE,
+                    &Isometry3::identity(),
+                )),
+            }
         });
         let body = camera.as_ref().and_then(|camera| {
             let joints = self.body.as_ref()?;
@@ -429,9 +456,15 @@ impl Recording {
         let mut chosen = Vec::with_capacity(settings.frames());
         for k in 0..settings.frames() {
             let tick = start + (k as f64 / settings.fps * SECOND as f64).round() as i64;
-            let Some(near) = nearest(&kept, tick) else {
+            let Some(mut near) = nearest(&kept, tick) else {
                 return Ok(Err(missing));
             };
+            // Half-way between two frames the release's rule rounds to even, counted from the clip's first frame.
+            if let Some(next) = kept.get(near + 1) {
+                let tie = ((next - tick) - (tick - kept[near])).abs() <= TIE;
+                let from_first = times[near] - chosen.first().copied().unwrap_or(times[near]);
+                near += usize::from(tie && from_first % 2 == 1);
+            }
             let beyond = settings.pad_short && tick >= end - period;
             if (kept[near] - tick).abs() > tolerance && !beyond {
                 return Ok(Err(missing));
@@ -444,12 +477,18 @@ impl Recording {
         let mut squares = Vec::with_capacity(distinct.len());
         let mut depths = Vec::with_capacity(distinct.len());
         // One picture at a time: full-size pictures are not held.
-        for &frame in &distinct {
-            let picture = colour.read(&[frame])?.pop().ok_or_else(|| {
-                SourceError::Settings("a reader of pictures gave none".to_owned())
-            })?;
+        colour.read(&distinct, &mut |frame, picture| {
             squares.push(self.square(picture, colour.times()[frame], settings).data);
-            if let Some(depth) = &self.depth {
+        })?;
+        if squares.len() != distinct.len() {
+            return Err(SourceError::Settings(format!(
+                "{} of {} pictures were read",
+                squares.len(),
+                distinct.len()
+            )));
+        }
+        if let Some(depth) = &self.depth {
+            for &frame in &distinct {
                 let time = colour.times()[frame];
                 let near = nearest(depth.times(), time).unwrap_or(0);
                 depths.push(self.square_depth(&depth.read(near)?, time, settings));
@@ -639,7 +678,8 @@ fn pinhole(camera: &Camera, degrees: f64, side: u32) -> Camera {
 }
 
 /// `R_stored_upright`: a picture turned clockwise has its new x along the old -y and its new y along the old x.
-fn upright(turn: Turn) -> Isometry3<f64> {
+#[must_use]
+pub fn upright(turn: Turn) -> Isometry3<f64> {
     let quarter = match turn {
         Turn::None => 0.0,
         Turn::Clockwise => -1.0,

@@ -5,9 +5,12 @@ mod egom2p_examples;
 mod metrics;
 mod parity;
 mod reconstruction;
+mod recordings_bad;
+mod recordings_golden;
 mod recordings_video;
 mod shared;
 mod trajectories;
+mod vrs_writer;
 
 mod language;
 mod language_ops;

@@ -184,3 +184,99 @@ fn a_clip_is_the_area_resized_centre_square() {
     assert_eq!([pixel(2, 0)[0], pixel(3, 0)[0], pixel(4, 0)[0]], [100; 3]);
     assert!(video.load_clip(3, 30.0, 1, 4).is_err());
 }
+
+fn own(name: &str) -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR"))
+        .join("tests/data")
+        .join(name)
+}
+
+/// CRC-32 over the RGB bytes of all frames, made once with ffmpeg 5.1.9 (`-vsync passthrough -f rawvideo -pix_fmt rgb24`).
+#[test]
+fn own_videos_have_ffmpegs_pixels_whatever_the_container_does() {
+    for (name, frames, size, golden) in [
+        ("synthetic_30fps.mp4", 75, (96, 64), 0x722c_5ab5),
+        ("synthetic_fragmented.mp4", 75, (96, 64), 0x722c_5ab5),
+        ("synthetic_rotated.mp4", 17, (64, 96), 0xf755_4f43),
+        ("synthetic_variable.mp4", 43, (96, 64), 0xdc79_4fd6),
+    ] {
+        let video = Video::open(own(name)).unwrap();
+        let info = video.info();
+        assert_eq!(
+            (info.frames, (info.width, info.height)),
+            (frames, size),
+            "{name}"
+        );
+        assert_eq!(info.decoder, "embedded H.264");
+        let mut crc = flate2::Crc::new();
+        for (index, frame) in video.frames(0..frames).unwrap().enumerate() {
+            let frame = frame.unwrap();
+            assert_eq!(frame.index, index);
+            crc.update(&frame.image.data);
+        }
+        assert_eq!(crc.sum(), golden, "{name}");
+    }
+}
+
+#[test]
+fn every_start_gives_the_frames_that_playing_from_the_beginning_gives() {
+    let video = Video::open(own("synthetic_30fps.mp4")).unwrap();
+    let all: Vec<Image> = video
+        .frames(0..75)
+        .unwrap()
+        .map(|frame| frame.unwrap().image)
+        .collect();
+    for start in [1, 7, 24, 25, 26, 49, 50, 63, 74] {
+        let found = video.frames(start..start + 3).unwrap();
+        let mut count = 0;
+        for frame in found {
+            let frame = frame.unwrap();
+            assert_eq!(
+                frame.image, all[frame.index],
+                "start {start}, frame {}",
+                frame.index
+            );
+            count += 1;
+        }
+        assert_eq!(count, 3.min(75 - start));
+    }
+    let clip = video.load_clip(10, 8.0, 16, 64).unwrap();
+    for (k, frame) in [
+        10, 14, 18, 21, 25, 29, 32, 36, 40, 44, 48, 51, 55, 59, 62, 66,
+    ]
+    .into_iter()
+    .enumerate()
+    {
+        let square = all[frame].square(64);
+        let found: Vec<u8> = clip
+            .frames
+            .index_axis(ndarray::Axis(0), k)
+            .iter()
+            .copied()
+            .collect();
+        assert_eq!(found, square.data, "clip frame {k}");
+    }
+}
+
+#[test]
+fn a_video_of_variable_rate_is_chosen_from_by_time() {
+    let video = Video::open(own("synthetic_variable.mp4")).unwrap();
+    assert!(video.info().variable_rate);
+    // 20 frames in the first 0.63 s, then one every 0.1 s.
+    let chosen = video.schedule().clip(0, 8.0, 16);
+    for (k, frame) in chosen.iter().enumerate() {
+        let wanted = k as f64 / 8.0;
+        assert!(
+            (video.schedule().seconds(*frame) - wanted).abs() <= 0.051,
+            "{k}: frame {frame}"
+        );
+    }
+}
+
+#[test]
+fn jpeg_pictures_are_read() {
+    let bytes = std::fs::read(own("tiny.jpg")).unwrap();
+    let image = Image::from_bytes(&bytes).unwrap();
+    assert_eq!((image.width, image.height), (24, 16));
+    assert!(image.data.iter().any(|v| *v > 200) && image.data.iter().any(|v| *v < 60));
+}
