@@ -133,11 +133,10 @@ pub fn convert(
             }
             let tally = Mutex::new(Tally::default());
             let edit = |change: &dyn Fn(&mut Tally)| {
-                change(
-                    &mut tally
-                        .lock()
-                        .unwrap_or_else(std::sync::PoisonError::into_inner),
-                )
+                let mut tally = tally
+                    .lock()
+                    .unwrap_or_else(std::sync::PoisonError::into_inner);
+                change(&mut tally);
             };
             let stopped = AtomicBool::new(false);
             let mut clips = (first..last).filter_map(|index| {

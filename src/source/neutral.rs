@@ -164,7 +164,7 @@ enum Axes {
 
 impl Axes {
     /// Columns: the axes of OpenCV in these.
-    fn from_opencv(self) -> Matrix3<f64> {
+    fn opencv_in(self) -> Matrix3<f64> {
         match self {
             Axes::Opencv => Matrix3::identity(),
             Axes::Opengl => Matrix3::from_diagonal(&Vector3::new(1.0, -1.0, -1.0)),
@@ -280,7 +280,7 @@ fn manifest(folder: &Path) -> Result<Manifest, SourceError> {
     let manifest: Manifest = serde_saphyr::from_str(&text).map_err(|error| {
         let place = error
             .location()
-            .map_or(Place::File, |at| Place::Line(at.line() as u64));
+            .map_or(Place::File, |at| Place::Line(at.line()));
         SourceError::malformed(&path, place, error.to_string())
     })?;
     if manifest.format != FORMAT {
@@ -571,7 +571,7 @@ fn poses(
                 Direction::CameraToWorld => pose,
                 Direction::WorldToCamera => pose.inverse(),
             };
-            let axes = Rotation3::from_matrix_unchecked(entry.axes.from_opencv());
+            let axes = Rotation3::from_matrix_unchecked(entry.axes.opencv_in());
             Ok(Some(pose * UnitQuaternion::from_rotation_matrix(&axes)))
         })
         .collect()

@@ -69,6 +69,9 @@ fn small_vrs() -> VrsWriter {
     writer
 }
 
+/// Reads a table and says how many rows it has.
+type Reader = fn(&Path) -> Result<usize, SourceError>;
+
 fn read_all(path: &Path) -> Result<usize, SourceError> {
     let vrs = Arc::new(Vrs::open(path)?);
     let mut count = 0;
@@ -189,7 +192,7 @@ proptest! {
     fn damaged_tables_never_panic(flips in proptest::collection::vec((0usize..100_000, 1u8..), 1..5), keep in 1usize..4000) {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("bad.csv");
-        let tables: [(&str, fn(&Path) -> Result<usize, SourceError>); 3] = [
+        let tables: [(&str, Reader); 3] = [
             (TRAJECTORY, |path| trajectory::read(path).map(|t| t.poses.times().len())),
             (GAZE, |path| gaze::read(path).map(|t| t.times().len())),
             (TRAJECTORY, |path| hand_tracking::read(path).map(|t| t[0].times().len())),
@@ -253,9 +256,8 @@ fn neutral_folder(folder: &Path, depth_rate: f64, depth_start: f64) {
     let poses = ndarray::Array3::from_shape_fn((75, 4, 4), |(t, r, c)| match (r, c) {
         (0, 3) => t as f64 * 0.01,
         (2, 3) => 1.6,
-        (3, 3) => 1.0,
         // Looking along world +y: camera x = world x, y = -z, z = y.
-        (0, 0) | (1, 2) => 1.0,
+        (0, 0) | (1, 2) | (3, 3) => 1.0,
         (2, 1) => -1.0,
         _ => 0.0,
     });

@@ -103,7 +103,7 @@ fn adt_camera_gaze_depth_and_body_are_the_references() {
 
     // Body in the gravity frame of the first camera. Heights do not depend on the choice of heading.
     let body = recording.body.as_ref().unwrap().at(times[0]).unwrap();
-    let T_gravity_world = gravity_frame(&found, &recording.up_world.unwrap()).unwrap();
+    let gravity_from_world = gravity_frame(&found, &recording.up_world.unwrap()).unwrap();
     let reference =
         |k: usize, axis: usize| frame["body21_gravity_frame"][k][axis].as_f64().unwrap();
     // Ours and the reference's index (its list: pelvis .. neck, head, left arm, right arm, left leg, right leg).
@@ -130,7 +130,7 @@ fn adt_camera_gaze_depth_and_body_are_the_references() {
         (20, 12),
     ];
     for (ours, theirs) in pairs {
-        let point = T_gravity_world * body[ours].unwrap();
+        let point = gravity_from_world * body[ours].unwrap();
         assert!(
             (point.z - reference(theirs, 2)).abs() < 2e-3,
             "joint {ours}: {point}"
@@ -141,7 +141,7 @@ fn adt_camera_gaze_depth_and_body_are_the_references() {
             "joint {ours}: {point}"
         );
     }
-    let toe = T_gravity_world * body[9].unwrap();
+    let toe = gravity_from_world * body[9].unwrap();
     assert!((toe.z - -1.5065).abs() < 2e-3, "{toe}");
 }
 

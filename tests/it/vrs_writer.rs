@@ -2,11 +2,13 @@
 
 use std::io::Write;
 
+type Tags = Vec<(String, String)>;
+
 /// A VRS file in memory: streams with layouts, records, an index.
 #[derive(Debug, Default)]
 pub struct VrsWriter {
     file_tags: Vec<(String, String)>,
-    streams: Vec<((i32, u16), Vec<(String, String)>)>,
+    streams: Vec<((i32, u16), Tags)>,
     records: Vec<(RecordHead, Vec<u8>)>,
 }
 

@@ -1,0 +1,67 @@
+//! Speed of reading recordings: `cargo bench --bench recordings`.
+//!
+//! Uses `$REVIV_SHARED/data/video/ego_kitchen_1080p30_4s.mp4` and the ADT sample where they are, else only the small video of
+//! the tests. Aim: a 2 s clip of 1080p30 in at most 1.3 s with the embedded decoder, 0.8 s with `ffmpeg`.
+
+use reviv::source::aria::vrs::Vrs;
+use reviv::source::recording::CutSettings;
+use reviv::source::video::{DecoderChoice, Video, VideoSettings, ffmpeg};
+use reviv::source::{Source, mps};
+use std::path::{Path, PathBuf};
+
+fn main() {
+    divan::main();
+}
+
+fn shared(name: &str) -> Option<PathBuf> {
+    let root = std::env::var_os("REVIV_SHARED").map_or_else(
+        || Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared"),
+        PathBuf::from,
+    );
+    let path = root.join("data").join(name);
+    path.exists().then_some(path)
+}
+
+fn clip(bencher: divan::Bencher<'_, '_>, path: &Path, decoder: DecoderChoice, side: u32) {
+    let settings = VideoSettings {
+        decoder,
+        ..VideoSettings::default()
+    };
+    let video = Video::open_with(path, &settings).expect("the video opens");
+    bencher.bench(|| video.load_clip(0, 8.0, 16, side).expect("the clip is read"));
+}
+
+#[divan::bench(sample_count = 5, sample_size = 1)]
+fn clip_1080p30_embedded(bencher: divan::Bencher<'_, '_>) {
+    if let Some(path) = shared("video/ego_kitchen_1080p30_4s.mp4") {
+        clip(bencher, &path, DecoderChoice::Embedded, 256);
+    }
+}
+
+#[divan::bench(sample_count = 5, sample_size = 1)]
+fn clip_1080p30_ffmpeg(bencher: divan::Bencher<'_, '_>) {
+    if let Some(path) = shared("video/ego_kitchen_1080p30_4s.mp4").filter(|_| ffmpeg::available()) {
+        clip(bencher, &path, DecoderChoice::Ffmpeg, 256);
+    }
+}
+
+#[divan::bench(sample_count = 20)]
+fn clip_small(bencher: divan::Bencher<'_, '_>) {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/synthetic_30fps.mp4");
+    clip(bencher, &path, DecoderChoice::Embedded, 64);
+}
+
+#[divan::bench(sample_count = 20)]
+fn vrs_index(bencher: divan::Bencher<'_, '_>) {
+    if let Some(path) = shared("adt_sample/video.vrs") {
+        bencher.bench(|| Vrs::open(&path).expect("the recording opens"));
+    }
+}
+
+#[divan::bench(sample_count = 10)]
+fn mps_clip(bencher: divan::Bencher<'_, '_>) {
+    if let Some(path) = shared("mps_sample") {
+        let source = mps::source(&path, CutSettings::default()).expect("the recording opens");
+        bencher.bench(|| source.clip(1).expect("the clip is made"));
+    }
+}
