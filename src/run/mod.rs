@@ -5,7 +5,7 @@
 //!   is written; [`error`] what can go wrong
 //! * [`checkpoint`] what a stage keeps to go on from; [`metrics`] and [`tensorboard`] what a stage records; [`progress`] what a person sees meanwhile; [`interrupt`] Ctrl-C
 //! * [`schedule`] what there is to do; [`stage`] one piece of it; [`execute`] all of it
-//! * [`provenance`] where everything came from; [`report`] the run's page
+//! * [`inputs`] what lies outside; [`provenance`] where everything came from; [`report`] the run's page
 //! * [`verify`] whether it still holds; [`gc`] what can go
 //! * [`environment`] the only place that looks at machine, git and clock
 
@@ -17,6 +17,7 @@ pub mod error;
 pub mod execute;
 pub mod files;
 pub mod gc;
+pub mod inputs;
 pub mod interrupt;
 pub mod lock;
 mod markdown;

@@ -2,7 +2,7 @@
 //! it), `plan.json` (what was promised) and `lock.json` (input hashes, git, machine, binary).
 
 use super::environment::{Environment, now_text};
-use super::error::{AtPath, RunError};
+use super::error::RunError;
 use super::execute::Job;
 use super::files;
 use super::record::RunDirectory;
@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 /// `lock.json`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -20,20 +20,8 @@ pub struct LockFile {
     /// When a process last began to work on the run, UTC.
     pub at: String,
     pub environment: Environment,
-    /// Outside files that stages read, by path.
+    /// Outside files and data sets that stages read, by path.
     pub files: Vec<FilePlan>,
-    /// Data sets that stages read, by name.
-    pub data: BTreeMap<String, DataSeal>,
-}
-
-/// A data set as it was: too large to hash its bytes, so the names and sizes of its files stand for them.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct DataSeal {
-    pub root: PathBuf,
-    pub files: u64,
-    pub bytes: u64,
-    /// blake3 of the sorted list of names and sizes.
-    pub listing: String,
 }
 
 /// Writes all four. A resumed run gets them anew; they say the same but for the machine and the time.
@@ -50,15 +38,10 @@ pub fn write(job: &Job<'_>, schedule: &Schedule, run: &RunDirectory) -> Result<(
     for file in schedule.works.iter().flat_map(|work| &work.files) {
         files.insert(&file.path, file);
     }
-    let mut data = BTreeMap::new();
-    for (name, root) in &schedule.data {
-        data.insert(name.clone(), DataSeal::of(root)?);
-    }
     let lock = LockFile {
         at: now_text(),
         environment,
         files: files.into_values().cloned().collect(),
-        data,
     };
     files::write_json(&run.path().join("lock.json"), &lock)
 }
@@ -248,42 +231,6 @@ fn scalar(value: &Value) -> String {
     value.to_string()
 }
 
-impl DataSeal {
-    /// Looks at every file of a data set.
-    pub fn of(root: &Path) -> Result<Self, RunError> {
-        let mut list: Vec<(String, u64)> = Vec::new();
-        let mut open = vec![PathBuf::new()];
-        while let Some(relative) = open.pop() {
-            let here = root.join(&relative);
-            for entry in std::fs::read_dir(&here).at("reading", &here)? {
-                let entry = entry.at("reading", &here)?;
-                let path = relative.join(entry.file_name());
-                if entry.file_type().at("reading", &here)?.is_dir() {
-                    open.push(path);
-                } else {
-                    // A link counts as the file it leads to; links to directories are not followed, for they may be circles.
-                    let bytes = std::fs::metadata(here.join(entry.file_name()))
-                        .map_or(0, |meta| meta.len());
-                    list.push((path.to_string_lossy().into_owned(), bytes));
-                }
-            }
-        }
-        list.sort();
-        let mut hasher = blake3::Hasher::new();
-        for (name, bytes) in &list {
-            hasher.update(&(name.len() as u64).to_le_bytes());
-            hasher.update(name.as_bytes());
-            hasher.update(&bytes.to_le_bytes());
-        }
-        Ok(Self {
-            root: root.into(),
-            files: list.len() as u64,
-            bytes: list.iter().map(|(_, bytes)| bytes).sum(),
-            listing: hasher.finalize().to_hex().to_string(),
-        })
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -300,19 +247,6 @@ mod tests {
                 "body", "a-b/c.d", "\"true\"", "\"1e3\"", "\"\"", "\"a: b\"", "\"#x\"", "\"No\""
             ]
         );
-    }
-
-    #[test]
-    fn a_data_set_that_gains_a_file_has_another_listing() {
-        let dir = tempfile::tempdir().unwrap();
-        std::fs::write(dir.path().join("a"), b"1").unwrap();
-        let before = DataSeal::of(dir.path()).unwrap();
-        assert_eq!(before, DataSeal::of(dir.path()).unwrap());
-        std::fs::create_dir(dir.path().join("more")).unwrap();
-        std::fs::write(dir.path().join("more/b"), b"1").unwrap();
-        let after = DataSeal::of(dir.path()).unwrap();
-        assert_eq!((after.files, after.bytes), (2, 2));
-        assert_ne!(before.listing, after.listing);
     }
 
     #[test]

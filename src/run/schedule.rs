@@ -5,7 +5,7 @@
 
 use super::cache::{Cache, Key};
 use super::error::{AtPath, RunError};
-use super::files;
+use super::inputs::Fingerprints;
 use super::record::Shard;
 use crate::experiment::{AnyOp, Experiment, Graph, OpEntry, Stage};
 use serde::{Deserialize, Serialize};
@@ -72,7 +72,7 @@ pub struct PortPlan {
     pub from: Vec<(String, Key)>,
 }
 
-/// An outside file as it was when the run was planned.
+/// An outside file or data set as it was when the run was planned.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct FilePlan {
     /// The settings key that names it.
@@ -85,13 +85,13 @@ pub struct FilePlan {
 impl Schedule {
     /// Lays out the work of a checked experiment. Reads every outside file once, to hash it.
     pub fn of(experiment: &Experiment) -> Result<Self, RunError> {
-        let mut hashes = BTreeMap::new();
+        let mut prints = Fingerprints::default();
         let mut cells = Vec::new();
         let mut works: Vec<Work> = Vec::new();
         let mut places: BTreeMap<Key, usize> = BTreeMap::new();
         for cell in &experiment.cells {
             let label = cell.label();
-            let keys = keys(&cell.graph, &mut hashes)?;
+            let keys = keys(&cell.graph, &mut prints)?;
             for (stage, &key) in cell.graph.stages.iter().zip(&keys) {
                 if let Some(&at) = places.get(&key) {
                     if !works[at].cells.contains(&label) {
@@ -100,7 +100,7 @@ impl Schedule {
                     continue;
                 }
                 places.insert(key, works.len());
-                works.push(work(&cell.graph, stage, key, &keys, &label, &hashes));
+                works.push(work(&cell.graph, stage, key, &keys, &label, &prints));
             }
             let read: BTreeSet<usize> = cell
                 .graph
@@ -241,7 +241,7 @@ fn work(
     key: Key,
     keys: &[Key],
     label: &str,
-    hashes: &Hashes,
+    prints: &Fingerprints,
 ) -> Work {
     let from = |index: &usize| (graph.stages[*index].name.clone(), keys[*index]);
     let inputs = stage.edges.iter().map(|edge| PortPlan {
@@ -249,12 +249,12 @@ fn work(
         from: edge.from.iter().map(from).collect(),
     });
     let files = stage.files.iter().map(|file| {
-        let (blake3, bytes) = hashes.get(&file.path).cloned().unwrap_or_default();
+        let print = prints.known(&file.path);
         FilePlan {
             key: file.key.clone(),
             path: file.path.clone(),
-            blake3,
-            bytes,
+            blake3: print.map_or_else(String::new, |print| print.hash.to_hex().to_string()),
+            bytes: print.map_or(0, |print| print.bytes),
         }
     });
     Work {
@@ -280,26 +280,14 @@ fn work(
     }
 }
 
-type Hashes = BTreeMap<PathBuf, (String, u64)>;
-
-fn keys(graph: &Graph, hashes: &mut Hashes) -> Result<Vec<Key>, RunError> {
+fn keys(graph: &Graph, prints: &mut Fingerprints) -> Result<Vec<Key>, RunError> {
     let mut failed = None;
-    let mut hash_file = |path: &Path| {
-        if let Some((known, _)) = hashes.get(path) {
-            return blake3::Hash::from_hex(known).map_err(std::io::Error::other);
-        }
-        match files::hash(path) {
-            Ok((hash, bytes)) => {
-                hashes.insert(path.to_path_buf(), (hash.to_hex().to_string(), bytes));
-                Ok(hash)
-            }
-            Err(error) => {
-                failed = Some(error);
-                Err(std::io::Error::other("see the error kept beside"))
-            }
-        }
-    };
-    let keys = graph.keys(&mut hash_file);
+    let keys = graph.keys(&mut |path| {
+        prints.of(path).map(|print| print.hash).map_err(|error| {
+            failed = Some(error);
+            std::io::Error::other("see the error kept beside")
+        })
+    });
     if let Some(error) = failed {
         return Err(error);
     }

@@ -7,9 +7,10 @@ use super::environment;
 use super::error::RunError;
 use super::execute::cache_of;
 use super::files;
+use super::inputs;
 use super::interrupt::Interrupt;
 use super::progress::Progress;
-use super::provenance::{DataSeal, LockFile};
+use super::provenance::LockFile;
 use super::record::RunDirectory;
 use super::schedule::{Schedule, Work};
 use super::stage::{self, Surroundings};
@@ -59,7 +60,7 @@ pub fn verify(
     let schedule: Schedule = files::read_json(&run.path().join("plan.json"))?;
     let lock: LockFile = files::read_json(&run.path().join("lock.json"))?;
     let cache = cache_of(run.runs());
-    let mut checks = inputs(&lock);
+    let mut checks = outside(&lock);
     for work in &schedule.works {
         interrupt.check()?;
         let label = work.label(schedule.sweep);
@@ -106,28 +107,15 @@ impl Check {
     }
 }
 
-fn inputs(lock: &LockFile) -> Vec<Check> {
+fn outside(lock: &LockFile) -> Vec<Check> {
     let mut checks = Vec::new();
     for file in &lock.files {
         let what = format!("input `{}`", file.path.display());
-        checks.push(match files::hash(&file.path) {
-            Ok((hash, _)) if hash.to_hex().as_str() == file.blake3 => {
-                Check::new(&what, Verdict::Same, "same bytes as when it was read")
+        checks.push(match inputs::fingerprint(&file.path) {
+            Ok(now) if now.hash.to_hex().as_str() == file.blake3 => {
+                Check::new(&what, Verdict::Same, "same as when it was read")
             }
-            Ok(_) => Check::new(&what, Verdict::Changed, "other bytes than when it was read"),
-            Err(error) => Check::new(&what, Verdict::Changed, error.to_string()),
-        });
-    }
-    for (name, seal) in &lock.data {
-        let what = format!("data set `{name}`");
-        checks.push(match DataSeal::of(&seal.root) {
-            Ok(now) if now.listing == seal.listing => {
-                Check::new(&what, Verdict::Same, "same files of the same sizes")
-            }
-            Ok(now) => {
-                let detail = format!("{} files now, {} when it was read", now.files, seal.files);
-                Check::new(&what, Verdict::Changed, detail)
-            }
+            Ok(_) => Check::new(&what, Verdict::Changed, "another than when it was read"),
             Err(error) => Check::new(&what, Verdict::Changed, error.to_string()),
         });
     }

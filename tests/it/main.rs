@@ -12,8 +12,11 @@ mod shared;
 mod trajectories;
 mod vrs_writer;
 
+mod kill;
 mod language;
 mod language_ops;
+mod rules;
 mod run;
+mod tensorboard;
 mod view;
 mod vq_structure;

@@ -56,7 +56,14 @@ impl Op for Numbers {
             numbers = serde_json::from_slice(&bytes).map_err(StageError::other)?;
         }
         let resumed = !numbers.is_empty();
+        // Not a setting: what is made does not depend on how long it takes.
+        let pause = std::env::var("REVIV_TEST_PAUSE_MS")
+            .ok()
+            .and_then(|text| text.parse().ok());
         for step in numbers.len() as u64 + 1..=settings.steps {
+            if let Some(pause) = pause {
+                std::thread::sleep(std::time::Duration::from_millis(pause));
+            }
             numbers.push(reviv::random::stream(context.seed(), "test.numbers", step, 0).random());
             context.record(step, &[("value", numbers[numbers.len() - 1])])?;
             context.progress(step, settings.steps, "steps");
@@ -180,7 +187,7 @@ fn stage(
     }
 }
 
-fn cell(arm: &str, seed: u64, numbers: Value, scale: f64) -> Cell {
+pub fn cell(arm: &str, seed: u64, numbers: Value, scale: f64) -> Cell {
     let edge = Edge {
         port: "numbers",
         from: vec![0],
@@ -196,7 +203,7 @@ fn cell(arm: &str, seed: u64, numbers: Value, scale: f64) -> Cell {
     }
 }
 
-fn experiment(cells: Vec<Cell>) -> Experiment {
+pub fn experiment(cells: Vec<Cell>) -> Experiment {
     Experiment {
         name: "totals".into(),
         about: "Sums.".into(),
@@ -225,12 +232,12 @@ fn run_as(
     })
 }
 
-fn run(experiment: &Experiment, runs: &Path) -> Outcome {
+pub fn run(experiment: &Experiment, runs: &Path) -> Outcome {
     run_as(experiment, runs, None, "1/1").unwrap()
 }
 
 /// Every artifact of a cache: relative path to bytes.
-fn artifacts(cache: &Cache) -> BTreeMap<String, Vec<u8>> {
+pub fn artifacts(cache: &Cache) -> BTreeMap<String, Vec<u8>> {
     let mut all = BTreeMap::new();
     for leaf in cache
         .entries()

@@ -1,0 +1,290 @@
+//! The rules of the house, read from the sources themselves.
+
+use std::path::{Path, PathBuf};
+
+/// From the door down: a room uses rooms of its own floor and of the floors below, never of a floor above.
+const FLOORS: &[&[&str]] = &[
+    &["cli"],
+    &["ops"],
+    &["experiment", "run"],
+    &[
+        "training",
+        "decoding",
+        "reconstruction",
+        "evaluation",
+        "view",
+        "import",
+    ],
+    &["tokenizer", "mget", "masking"],
+    &["modality", "clip", "source"],
+    &["nn", "engine", "geometry", "formats", "random"],
+];
+
+/// The framework knows no model: beside itself it may use nothing but these.
+const FRAMEWORK_USES: &[&str] = &["experiment", "run", "formats", "random"];
+
+/// A file holds one idea. Tests below it do not count.
+const MOST_LINES: usize = 500;
+
+/// Longer already, to be split. A number may only fall.
+const LONGER: &[(&str, usize)] = &[
+    ("src/experiment/resolve.rs", 815),
+    ("src/experiment/typed.rs", 780),
+    ("src/experiment/yaml.rs", 569),
+    ("src/import/pickle.rs", 806),
+    ("src/formats/npy.rs", 623),
+    ("src/reconstruction/predictions.rs", 530),
+    ("src/evaluation/evaluate.rs", 504),
+];
+
+struct File {
+    /// Relative to the package, with `/`.
+    name: String,
+    text: String,
+}
+
+impl File {
+    /// The lines above the tests, without comments, numbered from 1.
+    fn code(&self) -> impl Iterator<Item = (usize, &str)> {
+        let lines = self
+            .text
+            .lines()
+            .enumerate()
+            .map(|(at, line)| (at + 1, line));
+        let code = lines.take_while(|(_, line)| *line != "#[cfg(test)]");
+        code.map(|(at, line)| (at, line.split("//").next().unwrap_or("")))
+    }
+
+    /// `run` for `src/run/cache.rs`.
+    fn room(&self) -> Option<&str> {
+        let inside = self.name.strip_prefix("src/")?;
+        let room = inside.split('/').next()?;
+        Some(room.strip_suffix(".rs").unwrap_or(room))
+    }
+}
+
+fn files(folder: &str) -> Vec<File> {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let mut found = Vec::new();
+    let mut open = vec![root.join(folder)];
+    while let Some(path) = open.pop() {
+        let Ok(listing) = std::fs::read_dir(&path) else {
+            continue;
+        };
+        let mut entries: Vec<PathBuf> = listing.map(|entry| entry.unwrap().path()).collect();
+        entries.sort();
+        for path in entries {
+            if path.is_dir() {
+                open.push(path);
+            } else if path.extension().is_some_and(|extension| extension == "rs") {
+                let name = path
+                    .strip_prefix(root)
+                    .unwrap()
+                    .to_string_lossy()
+                    .replace('\\', "/");
+                let text = std::fs::read_to_string(&path).unwrap();
+                found.push(File { name, text });
+            }
+        }
+    }
+    found
+}
+
+/// Every line of `src/` outside tests that breaks a rule.
+fn broken(breaks: impl Fn(&File, &str) -> Option<String>) -> Vec<String> {
+    let mut lines = Vec::new();
+    let sources = files("src");
+    assert!(sources.len() > 20, "the sources were not found");
+    for file in &sources {
+        for (at, line) in file.code() {
+            if let Some(why) = breaks(file, line) {
+                lines.push(format!("{}:{at}: {why}: {}", file.name, line.trim()));
+            }
+        }
+    }
+    lines
+}
+
+fn floor(room: &str) -> Option<usize> {
+    FLOORS.iter().position(|rooms| rooms.contains(&room))
+}
+
+#[test]
+fn arrows_between_rooms_point_down_only() {
+    let found = broken(|file, line| {
+        let room = file.room()?;
+        let here = floor(room)?;
+        for part in line.split("crate::").skip(1) {
+            let used: String = part
+                .chars()
+                .take_while(|c| c.is_ascii_alphanumeric() || *c == '_')
+                .collect();
+            let Some(there) = floor(&used) else {
+                continue;
+            };
+            if there < here {
+                return Some(format!("`{room}` uses `{used}` from a floor above"));
+            }
+            if ["experiment", "run"].contains(&room) && !FRAMEWORK_USES.contains(&used.as_str()) {
+                return Some(format!(
+                    "the framework's `{room}` knows the science's `{used}`"
+                ));
+            }
+        }
+        None
+    });
+    assert!(found.is_empty(), "{}", found.join("\n"));
+}
+
+#[test]
+fn every_room_has_its_floor() {
+    for file in files("src") {
+        let room = file.room().unwrap().to_owned();
+        assert!(
+            ["lib", "main"].contains(&room.as_str()) || floor(&room).is_some(),
+            "{}: no floor for `{room}`",
+            file.name
+        );
+    }
+}
+
+#[test]
+fn a_file_holds_one_idea() {
+    let mut long = Vec::new();
+    for file in ["src", "tests", "examples", "benches"]
+        .iter()
+        .flat_map(|folder| files(folder))
+    {
+        let lines = file
+            .text
+            .lines()
+            .take_while(|line| *line != "#[cfg(test)]")
+            .count();
+        // Tables of tests are long by nature; a file of tests may be as long as it has cases.
+        let known = LONGER.iter().find(|(name, _)| *name == file.name);
+        if lines > known.map_or(MOST_LINES, |(_, most)| *most) && !file.name.starts_with("tests/") {
+            long.push(format!(
+                "{}: {lines} lines, at most {MOST_LINES}",
+                file.name
+            ));
+        }
+    }
+    assert!(long.is_empty(), "{}", long.join("\n"));
+}
+
+#[test]
+fn every_module_says_what_it_is() {
+    let silent: Vec<String> = files("src")
+        .into_iter()
+        .filter(|file| file.name != "src/main.rs" && !file.text.starts_with("//!"))
+        .map(|file| file.name)
+        .collect();
+    assert!(silent.is_empty(), "no module documentation: {silent:?}");
+}
+
+#[test]
+fn nothing_unwraps_outside_tests() {
+    let found = broken(|_, line| line.contains(".unwrap()").then(|| "unwraps".to_owned()));
+    assert!(found.is_empty(), "{}", found.join("\n"));
+}
+
+#[test]
+fn only_the_command_line_prints() {
+    let prints = [
+        "println!",
+        "print!(",
+        "eprintln!",
+        "eprint!(",
+        "dbg!(",
+        "stdout()",
+    ];
+    let found = broken(|file, line| {
+        let outside = file.room() != Some("cli");
+        (outside && prints.iter().any(|print| line.contains(print))).then(|| "prints".to_owned())
+    });
+    assert!(found.is_empty(), "{}", found.join("\n"));
+}
+
+#[test]
+fn only_the_environment_looks_at_the_clock() {
+    let found = broken(|file, line| {
+        let looks = line.contains("Instant::now") || line.contains("SystemTime::now");
+        (looks && file.name != "src/run/environment.rs").then(|| "looks at the clock".to_owned())
+    });
+    assert!(found.is_empty(), "{}", found.join("\n"));
+}
+
+#[test]
+fn no_generator_keeps_a_state_of_its_own() {
+    let stateful = [
+        "thread_rng",
+        "rand::rng()",
+        "StdRng",
+        "SmallRng",
+        "from_os_rng",
+        "from_entropy",
+    ];
+    let found = broken(|_, line| {
+        let has = stateful.iter().any(|name| line.contains(name));
+        has.then(|| "randomness not from `random::stream`".to_owned())
+    });
+    assert!(found.is_empty(), "{}", found.join("\n"));
+}
+
+#[test]
+fn hash_maps_are_not_used_for_their_order() {
+    // Their order changes from run to run; nothing here needs them where a BTreeMap does not do.
+    let found = broken(|_, line| {
+        let has = line.contains("HashMap<") || line.contains("HashSet<");
+        has.then(|| "a map without an order".to_owned())
+    });
+    assert!(found.is_empty(), "{}", found.join("\n"));
+}
+
+#[test]
+fn only_the_engine_is_unsafe() {
+    let found = broken(|file, line| {
+        let outside = file.room() != Some("engine");
+        let has = ["unsafe {", "unsafe fn", "unsafe impl", "allow(unsafe_code)"]
+            .iter()
+            .any(|u| line.contains(u));
+        (outside && has).then(|| "unsafe".to_owned())
+    });
+    assert!(found.is_empty(), "{}", found.join("\n"));
+}
+
+#[test]
+fn every_shipped_experiment_checks_and_plans() {
+    use reviv::experiment::Code;
+    use reviv::experiment::catalog::Catalog;
+    use reviv::experiment::load::{Request, load};
+    let catalog = Catalog::linked();
+    for (path, _) in catalog.experiments() {
+        let request = Request {
+            path: Path::new(env!("CARGO_MANIFEST_DIR")).join(path),
+            ..Request::default()
+        };
+        let (experiment, report) = load(&catalog, &request);
+        // Whose data are elsewhere cannot be at fault here.
+        let elsewhere = report.diagnostics.iter().any(|d| d.code == Code::E0601);
+        if elsewhere
+            && report
+                .diagnostics
+                .iter()
+                .all(|d| d.code == Code::E0601 || d.code.is_warning())
+        {
+            continue;
+        }
+        let experiment = experiment.unwrap_or_else(|| panic!("{path}\n{}", report.render(false)));
+        for cell in &experiment.cells {
+            for stage in &cell.graph.stages {
+                let plan = cell.graph.plan(stage);
+                assert!(
+                    plan.flop.is_none_or(f64::is_finite),
+                    "{path}: {}",
+                    stage.name
+                );
+            }
+        }
+    }
+}
