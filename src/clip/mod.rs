@@ -9,6 +9,7 @@
 pub mod clock;
 pub mod depth_video;
 pub mod frames;
+pub mod statistics;
 
 use nalgebra::Isometry3;
 use ndarray::{Array1, Array2, Array3, Array4, ArrayD};

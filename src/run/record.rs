@@ -197,7 +197,8 @@ impl RunDirectory {
         let digits = identity.to_string();
         let path = (4..=digits.len())
             .map(|n| runs.join(format!("{day}-{name}-{}", &digits[..n])))
-            .find(|path| !path.exists())
+            // A directory without its `run.json` was begun by a process that was killed: it is ours to finish.
+            .find(|path| !path.join("run.json").exists())
             .ok_or_else(|| RunError::Request {
                 message: format!("every name for this run is taken in `{}`", runs.display()),
                 help: "move old run directories away".into(),
