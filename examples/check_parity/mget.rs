@@ -86,8 +86,8 @@ struct Fixture {
     masks: Vec<Mask>,
 }
 
-fn fixture(file: &Vectors) -> Outcome<Fixture> {
-    let settings = &file.settings;
+/// The model that `settings` describe, and the release's names of its modalities in order.
+pub(super) fn spec_of(settings: &Value) -> Outcome<(MgetSpec, Vec<String>)> {
     let size =
         |name: &str| -> Outcome<usize> { Ok(settings[name].as_u64().ok_or("a size")? as usize) };
     let theirs: Vec<String> = settings["modality_order"]
@@ -132,6 +132,11 @@ fn fixture(file: &Vectors) -> Outcome<Fixture> {
         positions: Positions::Released,
         modalities,
     };
+    Ok((spec, theirs))
+}
+
+fn fixture(file: &Vectors) -> Outcome<Fixture> {
+    let (spec, theirs) = spec_of(&file.settings)?;
     let mut model = Mget::to_load(&spec, &Compute::cpu())?;
     model.load(&parameters_of(&file.checkpoint()?, &model))?;
 
@@ -185,7 +190,7 @@ fn fixture(file: &Vectors) -> Outcome<Fixture> {
 }
 
 /// The checkpoint's entries that are parameters of `model`, under our names and shapes.
-fn parameters_of(checkpoint: &Weights, model: &Mget) -> Weights {
+pub(super) fn parameters_of(checkpoint: &Weights, model: &Mget) -> Weights {
     let shapes: BTreeMap<String, Vec<usize>> = model
         .inventory()
         .into_iter()

@@ -4,6 +4,7 @@ pub mod report;
 pub mod vectors;
 
 mod cosmos;
+mod generation;
 mod mask;
 mod mget;
 mod optim;
@@ -23,6 +24,7 @@ type Check = fn(&Path, &mut Report) -> Outcome;
 /// The folders that are known, and what compares each.
 const FOLDERS: &[(&str, Check)] = &[
     ("cosmos", cosmos::check),
+    ("gen", generation::check),
     ("mask", mask::check),
     ("mget", mget::check),
     ("optim", optim::check),

@@ -1,1 +1,17 @@
-//! Iterative parallel decoding: schedules, guidance, nucleus sampling, samplers (Supp. C).
+//! Iterative parallel decoding (Supp. C): given any tokens, generate any others.
+//!
+//! Read in this order: [`settings`] (a registry entry), [`schedule`] (tokens and temperature per step), [`plan`] (which target
+//! when, from what), [`model`] (what a model must answer), [`filter`] (logits to a token), [`generate`] (**the loop**), [`mget`] (the model).
+
+pub mod filter;
+pub mod generate;
+pub mod mget;
+pub mod model;
+pub mod plan;
+pub mod schedule;
+pub mod settings;
+
+pub use generate::{Generated, GeneratedTokens, generate};
+pub use mget::MgetTokens;
+pub use model::{DecodingError, Sample, Slot, TokenModality, TokenModel};
+pub use settings::DecodingSettings;

@@ -1,0 +1,134 @@
+//! MGET as a [`TokenModel`].
+
+use super::model::{Asked, DecodingError, Sample, Slot, TokenModality, TokenModel};
+use crate::engine::Tensor;
+use crate::engine::parameters::to_host;
+use crate::mget::{Content, Context, Mget, Sequence, Visible};
+use std::ops::Range;
+
+/// A model with the list of its modalities.
+#[derive(Debug)]
+pub struct MgetTokens<'m> {
+    model: &'m Mget,
+    modalities: Vec<TokenModality>,
+}
+
+impl<'m> MgetTokens<'m> {
+    #[must_use]
+    pub fn new(model: &'m Mget) -> Self {
+        let modalities = model
+            .spec()
+            .modalities
+            .iter()
+            .map(|modality| TokenModality {
+                name: modality.name.clone(),
+                tokens: modality.count(),
+                vocabulary: modality.vocabulary(),
+            })
+            .collect();
+        Self { model, modalities }
+    }
+}
+
+/// The decoder's output and which rows are whose.
+#[derive(Debug, Clone)]
+pub struct MgetAnswers {
+    /// `None` when nothing was asked.
+    y_MD: Option<Tensor<2>>,
+    asked: Sequence,
+}
+
+impl TokenModel for MgetTokens<'_> {
+    type Context = Context;
+    type Answers = MgetAnswers;
+
+    fn modalities(&self) -> &[TokenModality] {
+        &self.modalities
+    }
+
+    fn encode(&self, samples: &[Sample<'_>], hidden: &[bool]) -> Result<Context, DecodingError> {
+        let contents: Vec<Vec<Content<'_>>> = samples
+            .iter()
+            .map(|sample| {
+                sample
+                    .slots
+                    .iter()
+                    .map(|slot| match slot {
+                        Slot::Tokens { ids, .. } => Content::Ids(ids),
+                        Slot::Pixels(content) => *content,
+                    })
+                    .collect()
+            })
+            .collect();
+        let given: Vec<Vec<Vec<u32>>> = samples
+            .iter()
+            .map(|sample| {
+                sample
+                    .slots
+                    .iter()
+                    .zip(hidden)
+                    .zip(&self.modalities)
+                    .map(|((slot, hidden), modality)| match slot {
+                        _ if *hidden || !slot.is_given() => Vec::new(),
+                        Slot::Tokens { known, .. } => (0..known.len() as u32)
+                            .filter(|&p| known[p as usize])
+                            .collect(),
+                        Slot::Pixels(_) => (0..modality.tokens as u32).collect(),
+                    })
+                    .collect()
+            })
+            .collect();
+        let visible = Visible::new(
+            self.model.spec(),
+            &contents,
+            given.iter().map(Vec::as_slice),
+        )
+        .map_err(|error| DecodingError::Model(error.to_string()))?;
+        Ok(self.model.encode(&visible))
+    }
+
+    fn decode(&self, context: &Context, asked: &Asked) -> Result<MgetAnswers, DecodingError> {
+        for (m, modality) in self.modalities.iter().enumerate() {
+            let outside = asked
+                .iter()
+                .flat_map(|sample| &sample[m])
+                .find(|&&p| p as usize >= modality.tokens);
+            if let Some(position) = outside {
+                let reason = format!("`{}` has no position {position}", modality.name);
+                return Err(DecodingError::Model(reason));
+            }
+        }
+        let asked = Sequence::new(self.modalities.len(), asked.iter().map(Vec::as_slice));
+        let y_MD = self.model.decode(context, &asked);
+        Ok(MgetAnswers { y_MD, asked })
+    }
+
+    fn logits(
+        &self,
+        answers: &MgetAnswers,
+        modality: usize,
+        rows: Range<usize>,
+    ) -> Result<Vec<f32>, DecodingError> {
+        let missing = || {
+            DecodingError::Model(format!(
+                "rows {rows:?} of modality {modality} were not asked"
+            ))
+        };
+        let own = answers
+            .asked
+            .rows
+            .get(modality)
+            .and_then(|own| own.get(rows.clone()));
+        let mut part = Sequence {
+            rows: vec![Vec::new(); self.modalities.len()],
+            ..Sequence::default()
+        };
+        part.rows[modality] = own.ok_or_else(missing)?.to_vec();
+        let y_MD = answers.y_MD.as_ref().ok_or_else(missing)?;
+        let logits = self
+            .model
+            .logits(y_MD, &part, modality)
+            .ok_or_else(missing)?;
+        Ok(to_host(logits))
+    }
+}

@@ -1,0 +1,224 @@
+//! From settings to steps: what is decided when, from which inputs, and what the pass without conditions does not see.
+
+use super::model::{DecodingError, TokenModality};
+use super::settings::{DecodingSettings, Order, TargetSettings};
+
+/// Chains are independent of each other: each starts from what was given.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Chain {
+    /// One after the other; what a group decides is input to the next.
+    pub groups: Vec<Group>,
+}
+
+/// Targets that are decided together, step by step.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Group {
+    pub targets: Vec<Target>,
+    /// By modality: not seen by the pass without conditions.
+    pub hidden: Vec<bool>,
+}
+
+/// One target and its steps.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Target {
+    /// Index of the modality.
+    pub modality: usize,
+    pub settings: TargetSettings,
+    /// Tokens decided by each step.
+    pub counts: Vec<usize>,
+    /// Temperature of each step.
+    pub temperatures: Vec<f64>,
+}
+
+impl Group {
+    /// Steps of the longest target.
+    #[must_use]
+    pub fn steps(&self) -> usize {
+        self.targets
+            .iter()
+            .map(|t| t.counts.len())
+            .max()
+            .unwrap_or(0)
+    }
+}
+
+/// The plan for `targets`; `given[m]` says which modalities have known tokens, `open[m]` how many are still open.
+///
+/// # Errors
+/// When a name is unknown or a target is raw video.
+pub fn plan(
+    settings: &DecodingSettings,
+    modalities: &[TokenModality],
+    given: &[bool],
+    open: &[usize],
+    targets: &[&str],
+) -> Result<Vec<Chain>, DecodingError> {
+    let index = |name: &str| {
+        modalities
+            .iter()
+            .position(|m| m.name == name)
+            .ok_or_else(|| DecodingError::UnknownModality {
+                name: name.to_owned(),
+                known: modalities.iter().map(|m| m.name.clone()).collect(),
+            })
+    };
+    let mut wanted = Vec::new();
+    for name in targets {
+        let modality = index(name)?;
+        if modalities[modality].vocabulary.is_none() {
+            return Err(DecodingError::NotPredicted {
+                name: (*name).to_owned(),
+            });
+        }
+        if !wanted.contains(&modality) {
+            wanted.push(modality);
+        }
+    }
+    let hidden: Vec<bool> = match &settings.hide {
+        None => (0..modalities.len())
+            .map(|m| given[m] && !wanted.contains(&m))
+            .collect(),
+        // A name the model does not have hides nothing: presets name the inputs of every model.
+        Some(names) => modalities.iter().map(|m| names.contains(&m.name)).collect(),
+    };
+    let target = |modality: usize| {
+        let settings = settings.target(&modalities[modality].name);
+        let counts = settings.schedule_counts(open[modality]);
+        Target {
+            modality,
+            temperatures: settings
+                .temperature_schedule
+                .values(settings.temperature, &counts),
+            counts,
+            settings,
+        }
+    };
+    let chain = |members: &[usize]| {
+        let mut hidden = hidden.clone();
+        let groups = members
+            .iter()
+            .map(|&modality| {
+                let group = Group {
+                    targets: vec![target(modality)],
+                    hidden: hidden.clone(),
+                };
+                hidden[modality] |= settings.grow;
+                group
+            })
+            .collect();
+        Chain { groups }
+    };
+    Ok(match settings.order {
+        Order::Chained => vec![chain(&wanted)],
+        Order::Joint => vec![Chain {
+            groups: vec![Group {
+                targets: wanted.iter().map(|&m| target(m)).collect(),
+                hidden,
+            }],
+        }],
+        Order::Independent => {
+            let mut chains: Vec<Chain> = Vec::new();
+            let mut done = vec![false; modalities.len()];
+            for &modality in &wanted {
+                if done[modality] {
+                    continue;
+                }
+                let name = &modalities[modality].name;
+                let members: Vec<usize> =
+                    match settings.chains.iter().find(|list| list.contains(name)) {
+                        None => vec![modality],
+                        Some(list) => list
+                            .iter()
+                            .filter_map(|name| {
+                                wanted
+                                    .iter()
+                                    .copied()
+                                    .find(|&m| &modalities[m].name == name)
+                            })
+                            .filter(|&m| !done[m])
+                            .collect(),
+                    };
+                for &m in &members {
+                    done[m] = true;
+                }
+                chains.push(chain(&members));
+            }
+            chains
+        }
+    })
+}
+
+impl TargetSettings {
+    fn schedule_counts(&self, tokens: usize) -> Vec<usize> {
+        // Random positions are spread evenly: there is nothing to be careful about first.
+        match self.scheme {
+            super::settings::Scheme::Roar => super::schedule::linear(self.steps, tokens),
+            super::settings::Scheme::Maskgit => self.schedule.counts(self.steps, tokens),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn modalities() -> Vec<TokenModality> {
+        ["rgb", "camera", "right_hand", "left_hand"]
+            .iter()
+            .map(|name| TokenModality {
+                name: (*name).to_owned(),
+                tokens: 30,
+                vocabulary: Some(64),
+            })
+            .collect()
+    }
+
+    #[test]
+    fn chains_keep_their_order_and_hide_what_is_finished() {
+        let settings = DecodingSettings {
+            chains: vec![vec!["right_hand".into(), "left_hand".into()]],
+            ..DecodingSettings::default()
+        };
+        let given = [true, false, false, false];
+        let chains = plan(
+            &settings,
+            &modalities(),
+            &given,
+            &[30; 4],
+            &["left_hand", "camera", "right_hand"],
+        )
+        .unwrap();
+        let members: Vec<Vec<usize>> = chains
+            .iter()
+            .map(|c| c.groups.iter().map(|g| g.targets[0].modality).collect())
+            .collect();
+        assert_eq!(members, [vec![2, 3], vec![1]]);
+        assert_eq!(chains[0].groups[0].hidden, [true, false, false, false]);
+        assert_eq!(chains[0].groups[1].hidden, [true, false, true, false]);
+        assert_eq!(chains[1].groups[0].hidden, [true, false, false, false]);
+    }
+
+    #[test]
+    fn unknown_names_and_raw_video_are_refused() {
+        let mut all = modalities();
+        all[0].vocabulary = None;
+        let ask = |names: &[&str]| {
+            plan(
+                &DecodingSettings::default(),
+                &all,
+                &[false; 4],
+                &[30; 4],
+                names,
+            )
+        };
+        assert!(matches!(
+            ask(&["gaze"]),
+            Err(DecodingError::UnknownModality { .. })
+        ));
+        assert!(matches!(
+            ask(&["rgb"]),
+            Err(DecodingError::NotPredicted { .. })
+        ));
+        assert_eq!(ask(&["camera", "camera"]).unwrap().len(), 1);
+    }
+}

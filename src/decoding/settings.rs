@@ -1,0 +1,161 @@
+//! Decoding as registry entries write it: `paper`, `release`, `fast`, or anyone's own.
+
+use super::filter::{Draw, Filter, TopK};
+use super::schedule::{TemperatureSchedule, TokenSchedule};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+
+/// Which positions a step decides.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Scheme {
+    /// Random open positions; only they are decoded.
+    Roar,
+    /// All open positions are decoded, and the ones it is surest of stay.
+    Maskgit,
+}
+
+/// How several targets depend on each other.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Order {
+    /// Every target sees only what was given (and, within a chain of `chains`, the targets before it).
+    Independent,
+    /// One after the other; finished targets are inputs of the next.
+    Chained,
+    /// All targets in every step.
+    Joint,
+}
+
+/// How tokens of one target are decided.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct TargetSettings {
+    pub scheme: Scheme,
+    /// Decoding steps; fewer are taken where there are fewer tokens.
+    #[schemars(range(min = 1))]
+    pub steps: usize,
+    pub schedule: TokenSchedule,
+    /// 0 takes the most likely token.
+    #[schemars(range(min = 0.0))]
+    pub temperature: f64,
+    pub temperature_schedule: TemperatureSchedule,
+    /// Classifier-free guidance: logits are `without + scale * (with - without)`. 1 is off and costs half.
+    pub guidance: f64,
+    /// Mass of the nucleus; 0 is off.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub top_p: f64,
+    pub top_k: TopK,
+    pub draw: Draw,
+}
+
+impl Default for TargetSettings {
+    fn default() -> Self {
+        Self {
+            scheme: Scheme::Roar,
+            steps: 3,
+            schedule: TokenSchedule::Linear,
+            temperature: 0.01,
+            temperature_schedule: TemperatureSchedule::Constant,
+            guidance: 2.0,
+            top_p: 0.8,
+            top_k: TopK::Off,
+            draw: Draw::Random,
+        }
+    }
+}
+
+impl TargetSettings {
+    pub(crate) fn filter(&self, temperature: f64) -> Filter {
+        Filter {
+            top_k: self.top_k,
+            top_p: self.top_p,
+            temperature,
+            draw: self.draw,
+        }
+    }
+}
+
+/// Changes to the settings for one target; what is not named stays.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct TargetChanges {
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub scheme: Option<Scheme>,
+    /// Decoding steps.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub steps: Option<usize>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub schedule: Option<TokenSchedule>,
+    /// 0 takes the most likely token.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub temperature: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub temperature_schedule: Option<TemperatureSchedule>,
+    /// Scale of the classifier-free guidance; 1 is off.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub guidance: Option<f64>,
+    /// Mass of the nucleus; 0 is off.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub top_p: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub top_k: Option<TopK>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub draw: Option<Draw>,
+}
+
+/// How targets are generated from whatever is given.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct DecodingSettings {
+    pub order: Order,
+    /// With `order: independent`: targets that are chained nevertheless, each list in its order.
+    pub chains: Vec<Vec<String>>,
+    /// Modalities that the pass without conditions does not see; absent: everything that was given.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub hide: Option<Vec<String>>,
+    /// The pass without conditions does not see finished targets of its chain either.
+    pub grow: bool,
+    /// For every target.
+    pub all: TargetSettings,
+    /// Changes by target.
+    pub targets: BTreeMap<String, TargetChanges>,
+}
+
+impl Default for DecodingSettings {
+    fn default() -> Self {
+        Self {
+            order: Order::Independent,
+            chains: Vec::new(),
+            hide: None,
+            grow: true,
+            all: TargetSettings::default(),
+            targets: BTreeMap::new(),
+        }
+    }
+}
+
+impl DecodingSettings {
+    /// The settings of one target.
+    #[must_use]
+    pub fn target(&self, name: &str) -> TargetSettings {
+        let all = self.all.clone();
+        let Some(changes) = self.targets.get(name) else {
+            return all;
+        };
+        TargetSettings {
+            scheme: changes.scheme.unwrap_or(all.scheme),
+            steps: changes.steps.unwrap_or(all.steps),
+            schedule: changes.schedule.unwrap_or(all.schedule),
+            temperature: changes.temperature.unwrap_or(all.temperature),
+            temperature_schedule: changes
+                .temperature_schedule
+                .unwrap_or(all.temperature_schedule),
+            guidance: changes.guidance.unwrap_or(all.guidance),
+            top_p: changes.top_p.unwrap_or(all.top_p),
+            top_k: changes.top_k.unwrap_or(all.top_k),
+            draw: changes.draw.unwrap_or(all.draw),
+        }
+    }
+}
