@@ -19,6 +19,7 @@ pub mod columns;
 pub mod compare;
 pub mod depth;
 pub mod evaluate;
+pub mod folders;
 pub mod gaze;
 pub mod joints;
 pub mod motion;

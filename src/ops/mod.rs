@@ -1,5 +1,8 @@
 //! The ops of the experiment language: one file per op, with its settings, its ports and what it runs.
 
+mod evaluate;
+mod kinds;
+mod table;
 pub mod tokenizer_entry;
 
 pub use tokenizer_entry::TokenizerEntry;

@@ -2,6 +2,7 @@
 #![allow(clippy::unwrap_used)] // A test that cannot go on should stop where it is.
 
 mod egom2p_examples;
+mod evaluation;
 mod metrics;
 mod parity;
 mod reconstruction;

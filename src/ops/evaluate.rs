@@ -1,0 +1,258 @@
+//! `op: evaluate`: scores predictions on a suite (Sec. 5). Writes `scores.json` and a table for the report page.
+//!
+//! Truth and predictions are folders of [`crate::reconstruction::predictions`]: those of other systems stand in `data.yaml` by
+//! name, so that EgoAllo, HaMeR or EgoM2P can be rows that we computed.
+
+use crate::evaluation::compare::{CompareSettings, Entrant, compare};
+use crate::evaluation::evaluate::{Embeddings, EvaluationError, evaluate};
+use crate::evaluation::folders::Folders;
+use crate::evaluation::render::{Format, render};
+use crate::evaluation::suite::Suite;
+use crate::experiment::{
+    Arity, ArtifactKind, Code, Description, Entry, FileInput, FilePath, Inputs, Op, OpEntry, Port,
+    Problem, StageContext, StageError,
+};
+use crate::formats::FormatError;
+use crate::formats::npz::Npz;
+use crate::reconstruction::predictions::Predictions;
+use ndarray::Ix2;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+use std::path::Path;
+
+/// Settings of [`Evaluate`].
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct EvaluateSettings {
+    /// What is computed.
+    pub suite: Entry<Suite>,
+    /// Predictions that no stage makes: a data set of `data.yaml`, a folder of npz files.
+    pub predictions_data: Option<String>,
+    /// The true clips: a data set of `data.yaml`, a folder of npz files with the same arrays.
+    pub truth_data: String,
+    /// The name of the row; absent: what the predictions call themselves.
+    pub system: Option<String>,
+    /// Motion embeddings of a model that is not part of this program (TMR): an npz with `predicted` and `truth`, `[clips, 256]`.
+    pub embeddings: Option<FilePath>,
+}
+
+impl Default for EvaluateSettings {
+    fn default() -> Self {
+        Self {
+            suite: Entry {
+                name: "world_all".to_owned(),
+                settings: Suite::default(),
+            },
+            predictions_data: None,
+            truth_data: String::new(),
+            system: None,
+            embeddings: None,
+        }
+    }
+}
+
+/// The op.
+#[derive(Debug)]
+pub struct Evaluate;
+inventory::submit! { OpEntry(&Evaluate) }
+
+impl Op for Evaluate {
+    type Settings = EvaluateSettings;
+
+    fn name(&self) -> &'static str {
+        "evaluate"
+    }
+
+    fn version(&self) -> u32 {
+        1
+    }
+
+    fn about(&self) -> &'static str {
+        "Scores predictions against the truth, beside the trivial baselines."
+    }
+
+    fn inputs(&self) -> &'static [Port] {
+        &[Port {
+            name: "predictions",
+            kinds: &[ArtifactKind::Predictions],
+            arity: Arity::Optional,
+            about: "what a model says about the clips; or name a data set in `predictions_data`",
+        }]
+    }
+
+    fn output(&self) -> ArtifactKind {
+        ArtifactKind::Scores
+    }
+
+    fn seeded(&self) -> bool {
+        false
+    }
+
+    fn files(&self, settings: &EvaluateSettings) -> Vec<FileInput> {
+        let file = |path: &FilePath| FileInput {
+            key: "embeddings".to_owned(),
+            path: path.0.clone().into(),
+        };
+        settings.embeddings.iter().map(file).collect()
+    }
+
+    fn data(&self, settings: &EvaluateSettings) -> Vec<(String, String)> {
+        let mut data = vec![(settings.truth_data.clone(), "truth_data".to_owned())];
+        data.extend(
+            settings
+                .predictions_data
+                .clone()
+                .map(|name| (name, "predictions_data".to_owned())),
+        );
+        data.retain(|(name, _)| !name.is_empty());
+        data
+    }
+
+    fn check(
+        &self,
+        settings: &EvaluateSettings,
+        inputs: &Inputs<'_>,
+        problems: &mut Vec<Problem>,
+    ) -> Description {
+        let connected = inputs.one("predictions").is_some();
+        if connected == settings.predictions_data.is_some() {
+            problems.push(
+                Problem::new(
+                    Code::E0206,
+                    "predictions",
+                    "an evaluation has one source of predictions",
+                )
+                .help("name a stage in `predictions`, or a data set in `predictions_data`"),
+            );
+        }
+        if settings.truth_data.is_empty() {
+            problems.push(
+                Problem::new(Code::E0204, "truth_data", "the true clips are not named")
+                    .help("name a data set of `data.yaml`: a folder of npz files"),
+            );
+        }
+        match settings.suite.settings.columns() {
+            Ok(columns) => Description {
+                columns: columns.into_iter().map(|c| c.name).collect(),
+                ..Description::default()
+            },
+            Err(error) => {
+                let help = format!("there are: {}", error.known.join(" "));
+                problems
+                    .push(Problem::new(Code::E0203, "suite.metrics", error.to_string()).help(help));
+                Description::default()
+            }
+        }
+    }
+
+    fn run(
+        &self,
+        settings: &EvaluateSettings,
+        context: &mut dyn StageContext,
+    ) -> Result<Value, StageError> {
+        let truth = open(data_root(context, &settings.truth_data)?)?;
+        let predictions = match (
+            &settings.predictions_data,
+            context.inputs("predictions").first(),
+        ) {
+            (Some(name), _) => open(data_root(context, name)?)?,
+            (None, Some(artifact)) => open(&artifact.path)?,
+            (None, None) => return Err(input("no predictions", "name a stage in `predictions`")),
+        };
+        let embeddings = settings
+            .embeddings
+            .as_ref()
+            .map(|path| read_embeddings(path.as_ref()))
+            .transpose()
+            .map_err(StageError::other)?;
+        let system = settings
+            .system
+            .clone()
+            .unwrap_or_else(|| predictions.index.system.clone());
+        let folders = Folders::new(truth, predictions);
+        let outcome = evaluate(
+            &settings.suite.name,
+            &settings.suite.settings,
+            &system,
+            &folders,
+            embeddings.as_ref(),
+            &mut |done, total| {
+                context.progress(done as u64, total as u64, "clips");
+                !context.interrupted()
+            },
+        );
+        let scores = match outcome {
+            Ok(scores) => scores,
+            Err(EvaluationError::Interrupted) => return Err(StageError::Interrupted),
+            Err(error) => {
+                return Err(input(
+                    &error.to_string(),
+                    "a refused prediction would look like a good score",
+                ));
+            }
+        };
+        scores.write(context.output()).map_err(StageError::other)?;
+        let clips = scores.clips.len();
+        let entrant = Entrant {
+            label: system.clone(),
+            seeds: vec![scores],
+        };
+        let table = compare(
+            &settings.suite.name,
+            &[entrant],
+            &CompareSettings::default(),
+            None,
+        )
+        .map_err(StageError::other)?;
+        write_text(
+            context.output(),
+            "report/table.md",
+            &render(&table, Format::Markdown),
+        )?;
+        Ok(json!({"suite": settings.suite.name, "system": system, "clips": clips}))
+    }
+}
+
+fn input(message: &str, help: &str) -> StageError {
+    StageError::Input {
+        code: Code::E0601,
+        message: message.to_owned(),
+        help: help.to_owned(),
+    }
+}
+
+fn data_root<'a>(context: &'a dyn StageContext, name: &str) -> Result<&'a Path, StageError> {
+    context.data_root(name).ok_or_else(|| {
+        input(
+            &format!("data set `{name}` is not configured"),
+            "add it to `data.yaml`",
+        )
+    })
+}
+
+fn open(folder: &Path) -> Result<Predictions, StageError> {
+    Predictions::open(folder).map_err(|error| {
+        input(
+            &error.to_string(),
+            "a folder of npz files, or one with an index",
+        )
+    })
+}
+
+fn read_embeddings(path: &Path) -> Result<Embeddings, FormatError> {
+    let npz = Npz::read_some(path, &["predicted", "truth"])?;
+    Ok(Embeddings {
+        predicted: npz.get("predicted")?.to_dim::<f64, Ix2>()?,
+        truth: npz.get("truth")?.to_dim::<f64, Ix2>()?,
+    })
+}
+
+/// Writes a text file below an artifact, making its folder.
+pub(super) fn write_text(root: &Path, name: &str, text: &str) -> Result<(), StageError> {
+    let path = root.join(name);
+    if let Some(folder) = path.parent() {
+        std::fs::create_dir_all(folder).map_err(StageError::io(folder))?;
+    }
+    std::fs::write(&path, text).map_err(StageError::io(&path))
+}
