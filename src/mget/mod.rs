@@ -12,10 +12,12 @@ pub mod names;
 pub mod positions;
 pub mod size;
 pub mod spec;
+pub mod stored;
 
 pub use batch::{Batch, BatchError, Content, Sequence, Targets, Values, Visible};
 pub use loss::{Loss, LossValues, Losses};
 pub use model::{Context, Mget};
 pub use positions::Positions;
 pub use size::Size;
+pub use stored::StoredError;
 pub use spec::{Input, MgetSpec, ModalitySpec, SpecError};

@@ -1,0 +1,243 @@
+//! Token shards as a data set: `<folder>/<modality>/shard-000000.tar`, one member per clip (model.md 9.5).
+//!
+//! A member is `<clip>.npy` or `<clip>.npz` (array `arr_0`), integers of any width and of any shape with the right number of
+//! elements. Raw video lies beside the tokens as bytes. A clip whose member is missing from a modality, or whose ids all equal
+//! the vocabulary (how the release marks invalid hands), does not have that modality. Opening reads the shards' directories only;
+//! nothing is unpacked, and every read goes to the shard again, so one that vanishes is noticed.
+
+use super::source::{DataError, TokenSample, TokenSource};
+use crate::formats::{npy, npz};
+use crate::mget::MgetSpec;
+use crate::tokenizer::TokenGrid;
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::{Read, Seek, SeekFrom};
+use std::path::{Path, PathBuf};
+
+/// The largest member that is read: a raw clip of 32 frames of 512 x 512 has 25 MB.
+const MAX_MEMBER: u64 = 256 << 20;
+
+/// Token shards of one data set and split.
+#[derive(Debug)]
+pub struct Shards {
+    name: String,
+    /// Per modality of the model: its name, its number of values per clip, and its vocabulary (none for raw video).
+    modalities: Vec<(String, Vec<usize>, Option<usize>)>,
+    paths: Vec<PathBuf>,
+    /// In order of names; per modality where the member lies.
+    clips: Vec<(String, Vec<Option<Member>>)>,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Member {
+    shard: u32,
+    offset: u64,
+    length: u64,
+    zipped: bool,
+}
+
+fn shard_error(path: &Path, reason: &dyn std::fmt::Display) -> DataError {
+    DataError::Shard {
+        shard: path.display().to_string(),
+        reason: reason.to_string(),
+    }
+}
+
+impl Shards {
+    /// The shards below `folder`, one sub-folder per modality of `spec`.
+    ///
+    /// # Errors
+    /// When a folder or a shard cannot be read.
+    pub fn open(folder: &Path, name: &str, spec: &MgetSpec) -> Result<Self, DataError> {
+        let mut shards = Self {
+            name: name.to_owned(),
+            modalities: Vec::new(),
+            paths: Vec::new(),
+            clips: Vec::new(),
+        };
+        let mut members: BTreeMap<String, Vec<Option<Member>>> = BTreeMap::new();
+        for (index, modality) in spec.modalities.iter().enumerate() {
+            let shape = match modality.input {
+                crate::mget::Input::Tokens { ref grid, .. } => grid.clone(),
+                crate::mget::Input::Pixels { clip, .. } => clip.to_vec(),
+            };
+            shards.modalities.push((modality.name.clone(), shape, modality.vocabulary()));
+            for path in tars(&folder.join(&modality.name))? {
+                let shard = shards.paths.len() as u32;
+                for (stem, mut member) in directory(&path)? {
+                    member.shard = shard;
+                    let entry = members.entry(stem).or_insert_with(|| vec![None; spec.modalities.len()]);
+                    entry[index] = Some(member);
+                }
+                shards.paths.push(path);
+            }
+        }
+        shards.clips = members.into_iter().collect();
+        Ok(shards)
+    }
+
+    fn bytes(&self, member: Member) -> Result<Vec<u8>, DataError> {
+        let path = &self.paths[member.shard as usize];
+        let read = || -> std::io::Result<Vec<u8>> {
+            let mut file = File::open(path)?;
+            file.seek(SeekFrom::Start(member.offset))?;
+            let mut bytes = vec![0; member.length as usize];
+            file.read_exact(&mut bytes)?;
+            Ok(bytes)
+        };
+        read().map_err(|error| shard_error(path, &error))
+    }
+}
+
+/// The shards of one modality in order of names; none when the folder does not exist.
+fn tars(folder: &Path) -> Result<Vec<PathBuf>, DataError> {
+    if !folder.is_dir() {
+        return Ok(Vec::new());
+    }
+    let listing = std::fs::read_dir(folder).map_err(|error| shard_error(folder, &error))?;
+    let mut paths: Vec<PathBuf> = listing
+        .filter_map(|entry| Some(entry.ok()?.path()))
+        .filter(|path| path.extension().is_some_and(|extension| extension == "tar"))
+        .collect();
+    paths.sort();
+    Ok(paths)
+}
+
+/// The members of a shard by stem.
+fn directory(path: &Path) -> Result<Vec<(String, Member)>, DataError> {
+    let refuse = |error: std::io::Error| shard_error(path, &error);
+    let file = File::open(path).map_err(refuse)?;
+    let length = file.metadata().map_err(refuse)?.len();
+    let mut archive = tar::Archive::new(std::io::BufReader::new(file));
+    let mut members = Vec::new();
+    for entry in archive.entries_with_seek().map_err(refuse)? {
+        let entry = entry.map_err(refuse)?;
+        let name = entry.path().map_err(refuse)?.to_string_lossy().into_owned();
+        let Some((stem, zipped)) = name
+            .strip_suffix(".npy")
+            .map(|stem| (stem, false))
+            .or_else(|| Some((name.strip_suffix(".npz")?, true)))
+        else {
+            continue;
+        };
+        let member = Member {
+            shard: 0,
+            offset: entry.raw_file_position(),
+            length: entry.size(),
+            zipped,
+        };
+        if member.length > MAX_MEMBER || member.offset.saturating_add(member.length) > length {
+            return Err(shard_error(path, &format!("member {name} of {} bytes does not fit the file", member.length)));
+        }
+        members.push((stem.to_owned(), member));
+    }
+    Ok(members)
+}
+
+impl TokenSource for Shards {
+    fn name(&self) -> &str {
+        &self.name
+    }
+
+    fn len(&self) -> usize {
+        self.clips.len()
+    }
+
+    fn read(&self, index: usize) -> Result<TokenSample, DataError> {
+        let (key, members) = &self.clips[index];
+        let mut sample = TokenSample {
+            key: key.clone(),
+            ..TokenSample::default()
+        };
+        for ((name, shape, vocabulary), member) in self.modalities.iter().zip(members) {
+            let Some(member) = *member else { continue };
+            let path = &self.paths[member.shard as usize];
+            sample.shard = path.display().to_string();
+            let bytes = self.bytes(member)?;
+            let refuse = |error: &dyn std::fmt::Display| shard_error(path, &format!("{key}, {name}: {error}"));
+            let array = if member.zipped {
+                let arrays = npz::parse(&bytes).map_err(|error| refuse(&error))?;
+                let first = arrays.into_iter().next().map(|(_, array)| array);
+                first.ok_or_else(|| refuse(&"an empty archive"))?
+            } else {
+                npy::parse(&bytes).map_err(|error| refuse(&error))?
+            };
+            match vocabulary {
+                Some(vocabulary) => {
+                    let ids: Vec<u32> = array.to::<u32>().map_err(|error| refuse(&error))?.into_iter().collect();
+                    if ids.iter().all(|id| *id as usize == *vocabulary) {
+                        continue;
+                    }
+                    let grid = shape.clone();
+                    sample.tokens.insert(name.clone(), TokenGrid { ids, grid });
+                }
+                None => {
+                    let clip = array.to::<u8>().map_err(|error| refuse(&error))?;
+                    sample.pixels.insert(name.clone(), clip.into_iter().collect());
+                }
+            }
+        }
+        Ok(sample)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::mget::{ModalitySpec, Positions, Size};
+    use ndarray::ArrayD;
+
+    fn write(folder: &Path, modality: &str, members: &[(&str, Vec<i64>)]) {
+        let folder = folder.join(modality);
+        std::fs::create_dir_all(&folder).unwrap();
+        let mut tar = tar::Builder::new(File::create(folder.join("shard-000000.tar")).unwrap());
+        for (key, ids) in members {
+            let array = ArrayD::from_shape_vec(vec![ids.len()], ids.clone()).unwrap();
+            let bytes = npy::to_bytes(&npy::NpyArray::from(array));
+            let mut header = tar::Header::new_gnu();
+            header.set_size(bytes.len() as u64);
+            header.set_mode(0o644);
+            tar.append_data(&mut header, format!("{key}.npy"), bytes.as_slice()).unwrap();
+        }
+        tar.finish().unwrap();
+    }
+
+    fn spec() -> MgetSpec {
+        MgetSpec {
+            size: Size::default(),
+            positions: Positions::Released,
+            modalities: vec![
+                ModalitySpec::tokens("camera", &[2], 8),
+                ModalitySpec::tokens("left_hand", &[2], 4),
+            ],
+        }
+    }
+
+    #[test]
+    fn clips_are_read_by_modality_and_may_lack_one() {
+        let folder = tempfile::tempdir().unwrap();
+        write(folder.path(), "camera", &[("a", vec![1, 2]), ("b", vec![3, 4]), ("c", vec![5, 6])]);
+        write(folder.path(), "left_hand", &[("a", vec![0, 3]), ("c", vec![4, 4])]);
+        let shards = Shards::open(folder.path(), "set", &spec()).unwrap();
+        assert_eq!(shards.len(), 3);
+        assert_eq!(shards.read(0).unwrap().tokens["left_hand"].ids, [0, 3]);
+        assert_eq!(shards.read(1).unwrap().tokens["camera"].ids, [3, 4]);
+        assert!(!shards.read(1).unwrap().tokens.contains_key("left_hand"), "no member");
+        assert!(!shards.read(2).unwrap().tokens.contains_key("left_hand"), "marked invalid");
+    }
+
+    #[test]
+    fn a_shard_that_goes_away_or_is_cut_is_named() {
+        let folder = tempfile::tempdir().unwrap();
+        write(folder.path(), "camera", &[("a", vec![1, 2])]);
+        let shards = Shards::open(folder.path(), "set", &spec()).unwrap();
+        let path = folder.path().join("camera/shard-000000.tar");
+        let bytes = std::fs::read(&path).unwrap();
+        std::fs::remove_file(&path).unwrap();
+        assert!(shards.read(0).unwrap_err().to_string().contains("shard-000000.tar"));
+        std::fs::write(&path, &bytes[..600]).unwrap();
+        assert!(Shards::open(folder.path(), "set", &spec()).is_err());
+        std::fs::write(&path, &bytes).unwrap();
+        assert!(shards.read(0).is_ok());
+    }
+}
