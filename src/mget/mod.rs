@@ -19,5 +19,5 @@ pub use loss::{Loss, LossValues, Losses};
 pub use model::{Context, Mget};
 pub use positions::Positions;
 pub use size::Size;
-pub use stored::StoredError;
 pub use spec::{Input, MgetSpec, ModalitySpec, SpecError};
+pub use stored::StoredError;

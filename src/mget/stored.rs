@@ -34,7 +34,8 @@ impl Mget {
             path: path.clone(),
             reason,
         };
-        let text = serde_json::to_vec_pretty(self.spec()).map_err(|error| file(error.to_string()))?;
+        let text =
+            serde_json::to_vec_pretty(self.spec()).map_err(|error| file(error.to_string()))?;
         std::fs::write(&path, text).map_err(|error| file(error.to_string()))?;
         self.weights().write(&directory.join(WEIGHTS))?;
         Ok(())
@@ -50,12 +51,17 @@ impl Mget {
             path: path.clone(),
             reason,
         };
-        let length = std::fs::metadata(&path).map_err(|error| file(error.to_string()))?.len();
+        let length = std::fs::metadata(&path)
+            .map_err(|error| file(error.to_string()))?
+            .len();
         if length > MAX_SPEC {
-            return Err(file(format!("{length} bytes are too many for a description of a model")));
+            return Err(file(format!(
+                "{length} bytes are too many for a description of a model"
+            )));
         }
         let text = std::fs::read(&path).map_err(|error| file(error.to_string()))?;
-        let spec: MgetSpec = serde_json::from_slice(&text).map_err(|error| file(error.to_string()))?;
+        let spec: MgetSpec =
+            serde_json::from_slice(&text).map_err(|error| file(error.to_string()))?;
         let weights = Weights::read(&directory.join(WEIGHTS))?;
         // The file has every table in full: a description that asks for more than is there is refused before it is built.
         for (name, shape) in spec.parameters() {

@@ -4,5 +4,6 @@ mod evaluate;
 mod kinds;
 mod table;
 pub mod tokenizer_entry;
+pub mod train_mget;
 
 pub use tokenizer_entry::TokenizerEntry;

@@ -158,7 +158,7 @@ mod tests {
     fn data_sets_come_in_proportion_to_their_weights() {
         let order =
             Order::new(1, &["a", "b", "c"], &[10, 500, 90], Some(&[1.0, 2.0, 1.0])).unwrap();
-        let mut counts = [0; 3];
+        let mut counts = [0_usize; 3];
         for n in 0..8000 {
             let place = order.place(n);
             assert!(place.clip < [10, 500, 90][place.set]);

@@ -6,7 +6,8 @@
 //! nothing is unpacked, and every read goes to the shard again, so one that vanishes is noticed.
 
 use super::source::{DataError, TokenSample, TokenSource};
-use crate::formats::{npy, npz};
+use crate::formats::npy;
+use crate::formats::npz::Npz;
 use crate::mget::MgetSpec;
 use crate::tokenizer::TokenGrid;
 use std::collections::BTreeMap;
@@ -61,12 +62,16 @@ impl Shards {
                 crate::mget::Input::Tokens { ref grid, .. } => grid.clone(),
                 crate::mget::Input::Pixels { clip, .. } => clip.to_vec(),
             };
-            shards.modalities.push((modality.name.clone(), shape, modality.vocabulary()));
+            shards
+                .modalities
+                .push((modality.name.clone(), shape, modality.vocabulary()));
             for path in tars(&folder.join(&modality.name))? {
                 let shard = shards.paths.len() as u32;
                 for (stem, mut member) in directory(&path)? {
                     member.shard = shard;
-                    let entry = members.entry(stem).or_insert_with(|| vec![None; spec.modalities.len()]);
+                    let entry = members
+                        .entry(stem)
+                        .or_insert_with(|| vec![None; spec.modalities.len()]);
                     entry[index] = Some(member);
                 }
                 shards.paths.push(path);
@@ -127,7 +132,13 @@ fn directory(path: &Path) -> Result<Vec<(String, Member)>, DataError> {
             zipped,
         };
         if member.length > MAX_MEMBER || member.offset.saturating_add(member.length) > length {
-            return Err(shard_error(path, &format!("member {name} of {} bytes does not fit the file", member.length)));
+            return Err(shard_error(
+                path,
+                &format!(
+                    "member {name} of {} bytes does not fit the file",
+                    member.length
+                ),
+            ));
         }
         members.push((stem.to_owned(), member));
     }
@@ -154,27 +165,28 @@ impl TokenSource for Shards {
             let path = &self.paths[member.shard as usize];
             sample.shard = path.display().to_string();
             let bytes = self.bytes(member)?;
-            let refuse = |error: &dyn std::fmt::Display| shard_error(path, &format!("{key}, {name}: {error}"));
+            let refuse = |error: &dyn std::fmt::Display| {
+                shard_error(path, &format!("{key}, {name}: {error}"))
+            };
             let array = if member.zipped {
-                let arrays = npz::parse(&bytes).map_err(|error| refuse(&error))?;
-                let first = arrays.into_iter().next().map(|(_, array)| array);
+                let arrays = Npz::parse(&bytes).map_err(|error| refuse(&error))?.arrays;
+                let first = arrays.into_values().next();
                 first.ok_or_else(|| refuse(&"an empty archive"))?
             } else {
                 npy::parse(&bytes).map_err(|error| refuse(&error))?
             };
-            match vocabulary {
-                Some(vocabulary) => {
-                    let ids: Vec<u32> = array.to::<u32>().map_err(|error| refuse(&error))?.into_iter().collect();
-                    if ids.iter().all(|id| *id as usize == *vocabulary) {
-                        continue;
-                    }
-                    let grid = shape.clone();
-                    sample.tokens.insert(name.clone(), TokenGrid { ids, grid });
-                }
-                None => {
-                    let clip = array.to::<u8>().map_err(|error| refuse(&error))?;
-                    sample.pixels.insert(name.clone(), clip.into_iter().collect());
-                }
+            let Some(vocabulary) = vocabulary else {
+                let clip = array.to::<u8>().map_err(|error| refuse(&error))?;
+                sample
+                    .pixels
+                    .insert(name.clone(), clip.into_iter().collect());
+                continue;
+            };
+            let ids = array.to::<u32>().map_err(|error| refuse(&error))?;
+            let ids: Vec<u32> = ids.into_iter().collect();
+            if ids.iter().any(|id| *id as usize != *vocabulary) {
+                let grid = shape.clone();
+                sample.tokens.insert(name.clone(), TokenGrid { ids, grid });
             }
         }
         Ok(sample)
@@ -193,11 +205,12 @@ mod tests {
         let mut tar = tar::Builder::new(File::create(folder.join("shard-000000.tar")).unwrap());
         for (key, ids) in members {
             let array = ArrayD::from_shape_vec(vec![ids.len()], ids.clone()).unwrap();
-            let bytes = npy::to_bytes(&npy::NpyArray::from(array));
+            let bytes = npy::to_bytes(&npy::NpyArray::from(&array));
             let mut header = tar::Header::new_gnu();
             header.set_size(bytes.len() as u64);
             header.set_mode(0o644);
-            tar.append_data(&mut header, format!("{key}.npy"), bytes.as_slice()).unwrap();
+            tar.append_data(&mut header, format!("{key}.npy"), bytes.as_slice())
+                .unwrap();
         }
         tar.finish().unwrap();
     }
@@ -216,14 +229,28 @@ mod tests {
     #[test]
     fn clips_are_read_by_modality_and_may_lack_one() {
         let folder = tempfile::tempdir().unwrap();
-        write(folder.path(), "camera", &[("a", vec![1, 2]), ("b", vec![3, 4]), ("c", vec![5, 6])]);
-        write(folder.path(), "left_hand", &[("a", vec![0, 3]), ("c", vec![4, 4])]);
+        write(
+            folder.path(),
+            "camera",
+            &[("a", vec![1, 2]), ("b", vec![3, 4]), ("c", vec![5, 6])],
+        );
+        write(
+            folder.path(),
+            "left_hand",
+            &[("a", vec![0, 3]), ("c", vec![4, 4])],
+        );
         let shards = Shards::open(folder.path(), "set", &spec()).unwrap();
         assert_eq!(shards.len(), 3);
         assert_eq!(shards.read(0).unwrap().tokens["left_hand"].ids, [0, 3]);
         assert_eq!(shards.read(1).unwrap().tokens["camera"].ids, [3, 4]);
-        assert!(!shards.read(1).unwrap().tokens.contains_key("left_hand"), "no member");
-        assert!(!shards.read(2).unwrap().tokens.contains_key("left_hand"), "marked invalid");
+        assert!(
+            !shards.read(1).unwrap().tokens.contains_key("left_hand"),
+            "no member"
+        );
+        assert!(
+            !shards.read(2).unwrap().tokens.contains_key("left_hand"),
+            "marked invalid"
+        );
     }
 
     #[test]
@@ -234,7 +261,13 @@ mod tests {
         let path = folder.path().join("camera/shard-000000.tar");
         let bytes = std::fs::read(&path).unwrap();
         std::fs::remove_file(&path).unwrap();
-        assert!(shards.read(0).unwrap_err().to_string().contains("shard-000000.tar"));
+        assert!(
+            shards
+                .read(0)
+                .unwrap_err()
+                .to_string()
+                .contains("shard-000000.tar")
+        );
         std::fs::write(&path, &bytes[..600]).unwrap();
         assert!(Shards::open(folder.path(), "set", &spec()).is_err());
         std::fs::write(&path, &bytes).unwrap();

@@ -10,6 +10,7 @@ mod recordings_bad;
 mod recordings_golden;
 mod recordings_video;
 mod shared;
+mod train_mget;
 mod training;
 mod trajectories;
 mod vrs_writer;

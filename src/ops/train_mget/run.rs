@@ -1,0 +1,314 @@
+//! Running `op: train_mget`: what arrives, the loop, what leaves.
+
+use super::{TrainMgetSettings, measure, spec};
+use crate::engine::{Compute, Initialise};
+use crate::experiment::{Code, InputArtifact, StageContext, StageError, TokenFacts};
+use crate::masking::{Masking, PIXELS};
+use crate::mget::Mget;
+use crate::run::checkpoint;
+use crate::run::environment::Stopwatch;
+use crate::training::{
+    DataError, Feed, Loader, Order, Score, Shards, StepReport, TokenSource, Trainer, TrainingError,
+    TrainingSettings, Unigram, Validation,
+};
+use serde_json::{Value, json};
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::Arc;
+
+/// The file of held-out losses.
+const VALIDATION: &str = "validation.json";
+
+/// Clips whose tokens are counted for the baseline.
+const UNIGRAM_CLIPS: usize = 4096;
+
+fn input_error(error: impl Into<TrainingError>) -> StageError {
+    match error.into() {
+        TrainingError::Data(error @ DataError::Shard { .. }) => StageError::Input {
+            code: Code::E0601,
+            message: error.to_string(),
+            help: "bring the shard back and run again: training continues where it stopped".into(),
+        },
+        TrainingError::Data(error @ (DataError::Vocabulary { .. } | DataError::Length { .. })) => {
+            StageError::Input {
+                code: Code::E0401,
+                message: error.to_string(),
+                help: "make the tokens again with the tokenizers of this experiment".into(),
+            }
+        }
+        error => StageError::other(error),
+    }
+}
+
+/// A stage under way.
+pub(super) struct Run {
+    trainer: Trainer,
+    feed: Arc<Feed>,
+    validation: Validation,
+    baseline: BTreeMap<String, Score>,
+    settings: TrainingSettings,
+    masking: Masking,
+    tokenizers: Option<std::path::PathBuf>,
+}
+
+impl Run {
+    pub(super) fn prepare(
+        settings: &TrainMgetSettings,
+        context: &mut dyn StageContext,
+    ) -> Result<Self, StageError> {
+        let seed = context.seed();
+        let artifacts: Vec<InputArtifact> = ["tokens", "more_tokens"]
+            .iter()
+            .flat_map(|port| context.inputs(port).to_vec())
+            .collect();
+        let first = artifacts
+            .first()
+            .ok_or_else(|| damaged("no tokens arrived"))?;
+        let facts: BTreeMap<String, TokenFacts> =
+            serde_json::from_value(first.contents["tokens"].clone())
+                .map_err(|error| damaged(&format!("`tokens` of the manifest: {error}")))?;
+        let pixels = serde_json::from_value(first.contents[PIXELS].clone()).ok();
+        let spec = spec(settings, &facts, pixels);
+        let masking =
+            Masking::new(&settings.masking.settings, &spec.slots()).map_err(StageError::other)?;
+
+        let mut sources: Vec<Arc<dyn TokenSource>> = Vec::new();
+        for artifact in &artifacts {
+            let shards = Shards::open(&artifact.path.join("train"), &artifact.stage, &spec)
+                .map_err(input_error)?;
+            sources.push(Arc::new(shards));
+        }
+        let names: Vec<&str> = sources.iter().map(|source| source.name()).collect();
+        let lengths: Vec<usize> = sources.iter().map(|source| source.len()).collect();
+        let weights = (!settings.weights.is_empty()).then_some(settings.weights.as_slice());
+        let order = Order::new(seed, &names, &lengths, weights).map_err(input_error)?;
+        let training = &settings.training;
+        let schedule = training
+            .learning_rates(measure(settings, lengths.iter().sum::<usize>() as u64))
+            .map_err(StageError::other)?;
+
+        let held_out = Shards::open(&first.path.join("validation"), &first.stage, &spec)
+            .map_err(input_error)?;
+        let micro_batches = training.micro_batches();
+        let validation = Validation::new(
+            &spec,
+            &masking,
+            &held_out,
+            training.validation_clips,
+            micro_batches[0],
+            seed,
+        )
+        .map_err(input_error)?;
+        let unigram = Unigram::fit(&spec, &sources, UNIGRAM_CLIPS).map_err(input_error)?;
+        let baseline = validation.baseline(&unigram);
+
+        let compute =
+            Compute::new(settings.device, 0, settings.precision).map_err(StageError::other)?;
+        let model =
+            Mget::new(&spec, &Initialise::new(&compute, seed)).map_err(StageError::other)?;
+        context.log(&format!(
+            "{} parameters, {} training clips, {} steps of {} clips",
+            spec.parameter_count(),
+            lengths.iter().sum::<usize>(),
+            schedule.total(),
+            training.batch,
+        ));
+        let mut trainer = Trainer::new(model, training, schedule);
+        if let Some((step, path)) = checkpoint::latest(context.checkpoints()) {
+            trainer.resume(&path).map_err(StageError::other)?;
+            context.log(&format!("continues from step {step}"));
+        }
+        let tokenizers = Some(first.path.join("tokenizers")).filter(|path| path.is_dir());
+        Ok(Self {
+            trainer,
+            feed: Arc::new(Feed {
+                spec,
+                masking: masking.clone(),
+                sources,
+                order,
+                seed,
+                micro_batches,
+                repeat: training.repeat,
+            }),
+            validation,
+            baseline,
+            settings: training.clone(),
+            masking,
+            tokenizers,
+        })
+    }
+
+    pub(super) fn train(mut self, context: &mut dyn StageContext) -> Result<Value, StageError> {
+        let total = self.trainer.total_steps();
+        let start = self.trainer.progress().step;
+        let mut loader = Loader::start(&self.feed, start..total, self.settings.loader_threads);
+        let watch = Stopwatch::start();
+        let mut seconds = 0.0;
+        while self.trainer.progress().step < total {
+            if context.interrupted() {
+                self.save(context)?;
+                return Err(StageError::Interrupted);
+            }
+            let before = self.trainer.progress();
+            let report = self
+                .trainer
+                .step(self.feed.micro_batches.len(), || {
+                    loader.next(&|| watch.seconds())
+                })
+                .map_err(input_error)?;
+            let tokens = report.progress.input_tokens + report.progress.target_tokens
+                - before.input_tokens
+                - before.target_tokens;
+            let rate = tokens as f64 / (watch.seconds() - seconds).max(1e-9);
+            seconds = watch.seconds();
+            self.record(context, &report, rate)?;
+            context.progress(report.step, total, "steps");
+            let every = |interval: u64| {
+                interval > 0 && report.step.is_multiple_of(interval) && report.step < total
+            };
+            if every(self.settings.validate_every) {
+                self.validate(context)?;
+            }
+            if every(self.settings.checkpoint_every) {
+                self.save(context)?;
+            }
+        }
+        if watch.seconds() > 0.0 && start < total {
+            let share = loader.waited() / watch.seconds();
+            context.log(&format!(
+                "{:.1}% of the time was spent waiting for data",
+                100.0 * share
+            ));
+            context.record(total, &[("data/wait_share", share)])?;
+        }
+        drop(loader);
+        let scores = self.validate(context)?;
+        self.publish(context, &scores)
+    }
+
+    fn save(&self, context: &mut dyn StageContext) -> Result<(), StageError> {
+        let step = self.trainer.progress().step;
+        checkpoint::save(context, step, |_, directory| {
+            self.trainer.save(directory).map_err(StageError::other)
+        })
+    }
+
+    fn record(
+        &self,
+        context: &mut dyn StageContext,
+        report: &StepReport,
+        rate: f64,
+    ) -> Result<(), StageError> {
+        let names: Vec<String> = self
+            .feed
+            .spec
+            .modalities
+            .iter()
+            .map(|m| format!("loss/{}", m.name))
+            .collect();
+        let (input, target) = self.masking.nominal_tokens();
+        let nominal = report.progress.samples as f64 * (input + target) as f64;
+        let real = (report.progress.input_tokens + report.progress.target_tokens) as f64;
+        let mut scalars = vec![
+            ("loss", report.loss),
+            ("learning_rate", report.learning_rate),
+            ("gradient_norm", report.gradient_norm),
+            ("tokens/nominal", nominal),
+            ("tokens/real", real),
+            ("tokens/per_second", rate),
+        ];
+        for (name, loss) in names.iter().zip(&report.modalities) {
+            if let Some((loss, _)) = loss {
+                scalars.push((name, *loss));
+            }
+        }
+        context.record(report.step, &scalars)
+    }
+
+    fn validate(
+        &self,
+        context: &mut dyn StageContext,
+    ) -> Result<BTreeMap<String, Score>, StageError> {
+        let scores = self.validation.run(self.trainer.model());
+        let step = self.trainer.progress().step;
+        let mut scalars = Vec::new();
+        let mut text =
+            String::from("| modality | held-out loss | unigram | tokens |\n|---|---|---|---|\n");
+        for (name, score) in &scores {
+            let unigram = self
+                .baseline
+                .get(name)
+                .map_or(f64::NAN, |baseline| baseline.loss);
+            scalars.push((format!("validation/{name}"), score.loss));
+            scalars.push((format!("unigram/{name}"), unigram));
+            text.push_str(&row(name, score, unigram));
+        }
+        if !scores.is_empty() {
+            let mean = scores.values().map(|score| score.loss).sum::<f64>() / scores.len() as f64;
+            scalars.push(("validation/mean".to_owned(), mean));
+            let scalars: Vec<(&str, f64)> = scalars
+                .iter()
+                .map(|(name, value)| (name.as_str(), *value))
+                .collect();
+            context.record(step, &scalars)?;
+            context.record_text(step, "validation", &text)?;
+        }
+        Ok(scores)
+    }
+
+    fn publish(
+        self,
+        context: &mut dyn StageContext,
+        scores: &BTreeMap<String, Score>,
+    ) -> Result<Value, StageError> {
+        let output = context.output().to_path_buf();
+        self.trainer
+            .model()
+            .save(&output)
+            .map_err(StageError::other)?;
+        let validation = json!({"validation": scores, "unigram": self.baseline});
+        let path = output.join(VALIDATION);
+        std::fs::write(&path, format!("{validation:#}\n")).map_err(StageError::io(&path))?;
+        if let Some(tokenizers) = &self.tokenizers {
+            copy(tokenizers, &output.join("tokenizers"))?;
+        }
+        Ok(json!({
+            "mget": self.feed.spec,
+            "parameters": self.feed.spec.parameter_count(),
+            "progress": self.trainer.progress(),
+            "validation": scores,
+            "unigram": self.baseline,
+        }))
+    }
+}
+
+fn damaged(reason: &str) -> StageError {
+    StageError::Input {
+        code: Code::E0601,
+        message: format!("the tokens artifact cannot be used: {reason}"),
+        help: "run the stage that makes it again".into(),
+    }
+}
+
+/// Copies a folder.
+fn copy(from: &Path, to: &Path) -> Result<(), StageError> {
+    std::fs::create_dir_all(to).map_err(StageError::io(to))?;
+    for entry in std::fs::read_dir(from).map_err(StageError::io(from))? {
+        let path = entry.map_err(StageError::io(from))?.path();
+        let Some(name) = path.file_name() else {
+            continue;
+        };
+        let target = to.join(name);
+        if path.is_dir() {
+            copy(&path, &target)?;
+        } else {
+            std::fs::copy(&path, &target).map_err(StageError::io(&path))?;
+        }
+    }
+    Ok(())
+}
+
+fn row(name: &str, score: &Score, unigram: f64) -> String {
+    let Score { loss, tokens } = score;
+    format!("| {name} | {loss:.4} | {unigram:.4} | {tokens} |\n")
+}
