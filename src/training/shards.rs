@@ -1,4 +1,5 @@
-//! Token shards as a data set: `<folder>/<modality>/shard-000000.tar`, one member per clip (model.md 9.5).
+//! Token shards as a data set: `<folder>/<modality>/shard-000000.tar` (or up to three folders further down, as in
+//! `<modality>/<data set>/token/`), one member per clip (model.md 9.5).
 //!
 //! A member is `<clip>.npy` or `<clip>.npz` (array `arr_0`), integers of any width and of any shape with the right number of
 //! elements. Raw video lies beside the tokens as bytes. A clip whose member is missing from a modality, or whose ids all equal
@@ -94,18 +95,30 @@ impl Shards {
     }
 }
 
+/// How deep shards may lie below a modality's folder: `<modality>/<data set>/token/`.
+const DEPTH: usize = 3;
+
 /// The shards of one modality in order of names; none when the folder does not exist.
 fn tars(folder: &Path) -> Result<Vec<PathBuf>, DataError> {
-    if !folder.is_dir() {
-        return Ok(Vec::new());
+    let mut paths = Vec::new();
+    if folder.is_dir() {
+        collect(folder, DEPTH, &mut paths)?;
     }
-    let listing = std::fs::read_dir(folder).map_err(|error| shard_error(folder, &error))?;
-    let mut paths: Vec<PathBuf> = listing
-        .filter_map(|entry| Some(entry.ok()?.path()))
-        .filter(|path| path.extension().is_some_and(|extension| extension == "tar"))
-        .collect();
     paths.sort();
     Ok(paths)
+}
+
+fn collect(folder: &Path, depth: usize, into: &mut Vec<PathBuf>) -> Result<(), DataError> {
+    let refuse = |error: std::io::Error| shard_error(folder, &error);
+    for entry in std::fs::read_dir(folder).map_err(refuse)? {
+        let path = entry.map_err(refuse)?.path();
+        if path.is_dir() && depth > 0 {
+            collect(&path, depth - 1, into)?;
+        } else if path.extension().is_some_and(|extension| extension == "tar") {
+            into.push(path);
+        }
+    }
+    Ok(())
 }
 
 /// The members of a shard by stem.
