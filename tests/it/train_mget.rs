@@ -271,11 +271,11 @@ fn settings_that_cannot_work_are_refused_before_anything_runs() {
     );
     let message = first(&video, &|s| s.size.settings.width = 20);
     assert!(
-        message.contains("size.width") && message.contains("6"),
+        message.contains("size.width") && message.contains("by 6"),
         "{message}"
     );
     let message = first(&description, &|s| {
-        s.masking.settings.input_tokens = TokenBudget::Fixed(0)
+        s.masking.settings.input_tokens = TokenBudget::Fixed(0);
     });
     assert!(
         message.contains("masking.input_tokens") && message.contains("is 0"),
