@@ -1,8 +1,92 @@
 //! The command line: one file per command. Parse, call, print; nothing else prints.
+//!
+//! A new command is a new file with a `clap::Args` struct that implements [`Run`], a `mod` line and a line in
+//! `commands!`. Its doc comment is its help.
 
+mod check;
+mod completions;
+mod list;
+mod plan;
+mod request;
+mod schema;
+mod show;
+mod terminal;
+mod why;
+
+use clap::{CommandFactory as _, Parser as _};
 use std::process::ExitCode;
 
+pub use terminal::{Failure, Terminal};
+
+/// A command, parsed.
+pub trait Run {
+    /// Does it. What it prints goes through the terminal.
+    ///
+    /// # Errors
+    /// When the command has failed: the user's input (exit code 1), or the machine (exit code 2).
+    fn run(self, terminal: &Terminal) -> Result<(), Failure>;
+}
+
+macro_rules! commands {
+    ($($module:ident :: $name:ident),* $(,)?) => {
+        #[derive(clap::Subcommand)]
+        enum Command {
+            $($name(Box<$module::$name>),)*
+        }
+
+        impl Run for Command {
+            fn run(self, terminal: &Terminal) -> Result<(), Failure> {
+                match self {
+                    $(Self::$name(command) => command.run(terminal),)*
+                }
+            }
+        }
+    };
+}
+
+// In the order of `reviv --help`.
+commands! {
+    check::Check,
+    plan::Plan,
+    why::Why,
+    list::List,
+    show::Show,
+    schema::Schema,
+    completions::Completions,
+}
+
+/// Reconstruct the viewer and the view in 4D from one head-mounted video.
+#[derive(clap::Parser)]
+#[command(name = "reviv", version, about, max_term_width = 100)]
+struct Arguments {
+    #[command(subcommand)]
+    command: Command,
+}
+
+/// The whole command line, for completions.
+fn grammar() -> clap::Command {
+    Arguments::command()
+}
+
 /// Runs the `reviv` command line on the process arguments. Plug-in binaries call this from their own `main`.
+///
+/// Exit codes: 0 done, 1 the user's input, 2 the machine or a bug.
 pub fn main() -> ExitCode {
-    ExitCode::SUCCESS
+    let arguments = match Arguments::try_parse() {
+        Ok(arguments) => arguments,
+        Err(error) => {
+            // A closed pipe is no reason to complain.
+            let _ = error.print();
+            return if error.use_stderr() {
+                ExitCode::from(1)
+            } else {
+                ExitCode::SUCCESS
+            };
+        }
+    };
+    let terminal = Terminal::new();
+    match arguments.command.run(&terminal) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(failure) => terminal.fail(failure),
+    }
 }

@@ -52,6 +52,14 @@ impl<'a> Composer<'a> {
         self.read(&path, origin, Some(asked))
     }
 
+    /// The name of the text that a place is in.
+    pub fn name_of(&self, span: Span) -> String {
+        self.sources
+            .get(span.layer)
+            .map(|source| format!("`{}`", source.name))
+            .unwrap_or_default()
+    }
+
     /// A path written in a file, relative to where the reader stands.
     pub fn relative(&self, name: &str, asked: Span) -> PathBuf {
         self.sources
@@ -134,11 +142,7 @@ impl<'a> Composer<'a> {
         };
         let mut below: Option<Node> = None;
         let mut whole = true;
-        let asking = self
-            .sources
-            .get(span.layer)
-            .map(|source| source.name.clone())
-            .unwrap_or_default();
+        let asking = self.name_of(span);
         for name in names {
             let Some(text) = name.text() else {
                 self.diagnostics.push(

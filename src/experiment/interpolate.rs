@@ -10,6 +10,8 @@ use std::collections::BTreeMap;
 const MAX_TEXT: usize = 1 << 16;
 /// Values that substitution may make in one document.
 const MAX_WEIGHT: usize = yaml::MAX_WEIGHT;
+/// Substitutions in one document.
+const MAX_STEPS: usize = 20_000;
 
 /// The variables of the environment.
 pub type Environment<'a> = &'a BTreeMap<String, String>;
@@ -26,8 +28,10 @@ pub fn interpolate(
         environment,
         diagnostics,
         weight: 0,
+        steps: 0,
+        inside: Vec::new(),
     };
-    pass.node(node, 0)
+    pass.node(node)
 }
 
 struct Pass<'a> {
@@ -35,42 +39,43 @@ struct Pass<'a> {
     environment: Environment<'a>,
     diagnostics: &'a mut Vec<Diagnostic>,
     weight: usize,
+    steps: usize,
+    /// Parameters whose values are being substituted.
+    inside: Vec<String>,
 }
 
 impl Pass<'_> {
-    fn node(&mut self, mut node: Node, depth: usize) -> Node {
+    fn node(&mut self, mut node: Node) -> Node {
         node.data = match node.data {
-            Data::List(nodes) => {
-                Data::List(nodes.into_iter().map(|n| self.node(n, depth)).collect())
-            }
+            Data::List(nodes) => Data::List(nodes.into_iter().map(|n| self.node(n)).collect()),
             Data::Map(items) => Data::Map(
                 items
                     .into_iter()
                     .map(|mut item| {
-                        item.value = self.node(item.value, depth);
+                        item.value = self.node(item.value);
                         item
                     })
                     .collect(),
             ),
             Data::Text(text) if text.contains("${") => {
-                return self.text(&text, Node::new(Data::Null, node.span), node.before, depth);
+                return self.text(&text, Node::new(Data::Null, node.span), node.before);
             }
             other => other,
         };
         node
     }
 
-    fn text(&mut self, text: &str, place: Node, before: Option<Box<Node>>, depth: usize) -> Node {
+    fn text(&mut self, text: &str, place: Node, before: Option<Box<Node>>) -> Node {
         let fail = |mut place: Node| {
             place.data = Data::Text("???".to_owned());
             place
         };
-        if depth > 16 {
-            self.report(
-                &place,
-                "`${params...}` refer to each other in a circle",
-                "break the circle",
-            );
+        self.steps += 1;
+        if self.steps > MAX_STEPS {
+            return fail(place);
+        }
+        if self.steps == MAX_STEPS {
+            self.report(&place, "too many substitutions", "check `params`");
             return fail(place);
         }
         // A whole value keeps its type.
@@ -80,7 +85,7 @@ impl Pass<'_> {
             && !name.contains('}')
         {
             let mut node = match self.look_up(name, &place) {
-                Some(node) => self.node(node, depth + 1),
+                Some(node) => self.inside(name, node),
                 None => fail(place.clone()),
             };
             self.weight += node.weight();
@@ -123,7 +128,7 @@ impl Pass<'_> {
             let Some(node) = self.look_up(name, &place) else {
                 return fail(place);
             };
-            let node = self.node(node, depth + 1);
+            let node = self.inside(name, node);
             if matches!(node.data, Data::List(_) | Data::Map(_) | Data::Null) {
                 let message = format!(
                     "`${{{name}}}` is {} and cannot be part of a text",
@@ -150,7 +155,20 @@ impl Pass<'_> {
         node
     }
 
+    /// Substitutes inside what a name stands for.
+    fn inside(&mut self, name: &str, node: Node) -> Node {
+        self.inside.push(name.to_owned());
+        let node = self.node(node);
+        self.inside.pop();
+        node
+    }
+
     fn look_up(&mut self, name: &str, place: &Node) -> Option<Node> {
+        if self.inside.iter().any(|other| other == name) || self.inside.len() > 32 {
+            let circle = format!("`${{{name}}}` stands for itself");
+            self.report(place, &circle, "break the circle");
+            return None;
+        }
         if let Some(key) = name.strip_prefix("params.") {
             if let Some(node) = self.params.at(key) {
                 return Some(node.clone());

@@ -8,8 +8,9 @@ use super::graph::{Cell, Experiment};
 use super::problem::Code;
 use super::registry::Registry;
 use super::resolve::Resolver;
-use super::source::Sources;
+use super::source::{Origin, Source, Sources};
 use super::sweep;
+use super::typed::Typer;
 use super::yaml::{self, Node};
 use std::collections::BTreeMap;
 use std::io::Read as _;
@@ -68,6 +69,53 @@ pub fn load_in(
     (experiment, report)
 }
 
+/// Checks a file that may be an experiment, a sweep or a registry entry.
+pub fn check(catalog: &Catalog, request: &Request) -> (Option<Experiment>, Report) {
+    let text = read(&request.path).unwrap_or_default();
+    let kind =
+        super::registry::head(&text).and_then(|(kind, name)| Some((catalog.kind(kind)?, name)));
+    let Some((kind, name)) = kind else {
+        return load(catalog, request);
+    };
+    let mut report = Report::default();
+    let layer = report.sources.add(Source {
+        name: request.path.display().to_string(),
+        path: Some(request.path.clone()),
+        text: text.clone(),
+        origin: Origin::File,
+    });
+    let mut registry = Registry::new(catalog, None);
+    registry.put(kind.kind, name, layer, &text, &request.path);
+    let span = Span::point(layer, 0);
+    let node = registry.settings(
+        kind.kind,
+        name,
+        span,
+        &mut report.sources,
+        &mut report.diagnostics,
+    );
+    if let Some(node) = node {
+        let mut typer = Typer {
+            catalog,
+            registry: &mut registry,
+            sources: &mut report.sources,
+            diagnostics: &mut report.diagnostics,
+            traces: BTreeMap::new(),
+            beside: vec!["about", "extends"],
+            prefix: String::new(),
+        };
+        if let Some(value) = typer.value(&kind.schema, &node, "")
+            && let Err(error) = (kind.normalize)(value)
+        {
+            report
+                .diagnostics
+                .push(Diagnostic::new(Code::E0202, span, error.to_string()));
+        }
+    }
+    report.tidy();
+    (None, report)
+}
+
 fn build(
     catalog: &Catalog,
     request: &Request,
@@ -87,17 +135,19 @@ fn build(
     } else {
         sweep::single(&mut composer, root, patches)
     };
-    if diagnostics.iter().any(|d| !d.code.is_warning()) {
+    // Texts that are no YAML, or not there, make everything after them noise. Other mistakes come together.
+    let fatal = [Code::E0101, Code::E0102, Code::E0103, Code::E0104];
+    if diagnostics.iter().any(|d| fatal.contains(&d.code)) {
         return None;
     }
     let folder = beside(&request.path, "registry");
     let mut registry = Registry::new(catalog, folder.as_deref());
     for (entry, message) in &registry.problems {
-        let layer = sources.add(super::source::Source {
+        let layer = sources.add(Source {
             name: entry.place.clone(),
             path: None,
             text: entry.text.to_string(),
-            origin: super::source::Origin::Registry,
+            origin: Origin::Registry,
         });
         diagnostics.push(
             Diagnostic::new(Code::E0205, Span::point(layer, 0), message.clone())

@@ -8,8 +8,9 @@ use super::problem::Code;
 use super::yaml::{Data, Directive, Item, Node};
 
 /// The value that `over` makes of `base`.
-pub fn merge(base: Node, over: Node, diagnostics: &mut Vec<Diagnostic>) -> Node {
+pub fn merge(base: Node, mut over: Node, diagnostics: &mut Vec<Diagnostic>) -> Node {
     let directive = over.directive;
+    let history = over.before.take();
     match (base.data, over.data) {
         (Data::List(below), Data::List(above)) if directive == Some(Directive::Append) => {
             let mut nodes = below;
@@ -61,7 +62,12 @@ pub fn merge(base: Node, over: Node, diagnostics: &mut Vec<Diagnostic>) -> Node 
         }
         (below, above) => {
             let mut node = clean(Node::new(above, over.span));
-            node.before = Some(Box::new(Node {
+            node.before = history;
+            let mut oldest = &mut node.before;
+            while let Some(earlier) = oldest {
+                oldest = &mut earlier.before;
+            }
+            *oldest = Some(Box::new(Node {
                 data: below,
                 span: base.span,
                 directive: None,

@@ -86,6 +86,21 @@ impl Registry {
         );
     }
 
+    /// Puts an entry that has been read already in place of what has its name.
+    pub(super) fn put(&mut self, kind: &str, name: &str, layer: u32, text: &str, path: &Path) {
+        self.entries.insert(
+            (kind.to_owned(), name.to_owned()),
+            Slot {
+                text: EntryText {
+                    place: path.display().to_string(),
+                    text: text.to_owned().into(),
+                },
+                parsed: None,
+                layer: Some(layer),
+            },
+        );
+    }
+
     /// Names of a kind, sorted.
     pub fn names(&self, kind: &str) -> Vec<&str> {
         self.entries

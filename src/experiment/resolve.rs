@@ -200,6 +200,7 @@ impl Resolver<'_> {
             diagnostics: self.diagnostics,
             traces,
             beside,
+            prefix: format!("stages.{}.", item.key),
         };
         let value = typer.value(schema, &own, "");
         let traces = typer.traces;
@@ -648,6 +649,7 @@ impl Resolver<'_> {
             description: Description::default(),
             traces: draft.traces,
         };
+        let before = self.diagnostics.len();
         let place = |key: &str| place(key, &stage.traces, draft.span);
         for file in &stage.files {
             if !file.path.exists() {
@@ -707,6 +709,11 @@ impl Resolver<'_> {
                     .help(problem.help),
             );
         }
+        for diagnostic in &mut self.diagnostics[before..] {
+            if let Some(note) = used_at(diagnostic.span, &stage.traces, self.sources) {
+                diagnostic.notes.push(note);
+            }
+        }
         stage.description = description?;
         (!failed).then_some(stage)
     }
@@ -721,6 +728,7 @@ impl Resolver<'_> {
             diagnostics: self.diagnostics,
             traces: BTreeMap::new(),
             beside: Vec::new(),
+            prefix: "compare.".to_owned(),
         };
         let value = typer.value(schema, node, "")?;
         let compare: Compare = serde_json::from_value(value).ok()?;
@@ -766,6 +774,27 @@ fn place(key: &str, traces: &BTreeMap<String, Trace>, otherwise: Span) -> Span {
             None => return otherwise,
         }
     }
+}
+
+/// For a mistake inside a registry entry: where the experiment names the entry.
+fn used_at(span: Span, traces: &BTreeMap<String, Trace>, sources: &Sources) -> Option<String> {
+    let inside = |span: Span| {
+        sources
+            .get(span.layer)
+            .is_some_and(|source| source.origin == Origin::Registry)
+    };
+    if !inside(span) {
+        return None;
+    }
+    let (key, _) = traces.iter().find(|(_, trace)| trace.span == span)?;
+    let mut key = key.as_str();
+    while let Some((parent, _)) = key.rsplit_once('.') {
+        key = parent;
+        if let Some(trace) = traces.get(key).filter(|trace| !inside(trace.span)) {
+            return Some(format!("`{key}` is set at {}", sources.cite(trace.span)));
+        }
+    }
+    None
 }
 
 /// The setting that the settings struct refuses although its schema takes it.

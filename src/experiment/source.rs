@@ -131,6 +131,12 @@ impl Sources {
         (&source.name, line, column)
     }
 
+    /// The text of a span (its first line, where there are more).
+    pub fn slice(&self, span: Span) -> &str {
+        self.get(span.layer)
+            .map_or("", |source| &source.text[source.mark(span)])
+    }
+
     /// `file:line` of a span.
     pub fn cite(&self, span: Span) -> String {
         let (file, line, _) = self.place(span);

@@ -113,7 +113,8 @@ pub fn open(composer: &mut Composer<'_>, root: Node, patches: Vec<Node>) -> Opti
                 ));
                 return None;
             };
-            composer.named(file, node.span, Origin::Extended(String::new()))?
+            let sweep = composer.name_of(node.span);
+            composer.named(file, node.span, Origin::Extended(sweep))?
         }
     };
     if let Some(inner) = base.item("sweep") {

@@ -34,6 +34,8 @@ pub struct Typer<'c, 'm> {
     pub traces: BTreeMap<String, Trace>,
     /// Keys that are allowed beside the settings at the top: ports, `op`, `seed`.
     pub beside: Vec<&'static str>,
+    /// What the key paths start at, for messages: `stages.mget.`.
+    pub prefix: String,
 }
 
 /// A key path one level down.
@@ -64,8 +66,8 @@ impl<'c> Typer<'c, '_> {
     pub fn value(&mut self, schema: &'c Value, node: &Node, path: &str) -> Option<Value> {
         self.trace(node, path);
         if node.text() == Some("???") {
-            // A substitution that failed has been reported at this very place.
-            if self.diagnostics.iter().any(|d| d.span == node.span) {
+            // A substitution that failed has been reported.
+            if self.sources.slice(node.span).contains("${") {
                 return None;
             }
             self.report(
@@ -76,7 +78,8 @@ impl<'c> Typer<'c, '_> {
                 )
                 .label("left open here")
                 .help(format!(
-                    "give it in the file, or with `--set ...{path}=VALUE`"
+                    "give it in the file, or with `--set {}{path}=VALUE`",
+                    self.prefix
                 )),
             );
             return None;
@@ -355,6 +358,26 @@ impl<'c> Typer<'c, '_> {
                 None => whole = false,
             }
         }
+        for (name, property) in properties {
+            if items.iter().any(|item| item.key == *name) {
+                continue;
+            }
+            // A default that is a registry entry means the entry as the registry has it.
+            let default = property.pointer("/default/use").and_then(Value::as_str);
+            if let Some(entry) = default
+                && let Some((kind, settings)) = self.registry_of(property)
+            {
+                let path = below(path, name);
+                let named = Node::new(Data::Text(entry.to_owned()), node.span);
+                match self.entry(kind, settings, &named, &path) {
+                    Some(value) => {
+                        map.insert(name.clone(), value);
+                    }
+                    None => whole = false,
+                }
+                self.traces.remove(&path);
+            }
+        }
         for name in schema
             .get("required")
             .and_then(Value::as_array)
@@ -378,6 +401,19 @@ impl<'c> Typer<'c, '_> {
             }
         }
         whole.then_some(Value::Object(map))
+    }
+
+    /// The kind and settings of a registry reference, optional or not.
+    fn registry_of(&self, schema: &'c Value) -> Option<(&'c str, &'c Value)> {
+        let schema = self.follow(schema);
+        if let Some(kind) = schema.get("x-registry").and_then(Value::as_str) {
+            return Some((kind, schema.get("x-settings").unwrap_or(&ANYTHING)));
+        }
+        schema
+            .get("anyOf")
+            .and_then(Value::as_array)?
+            .iter()
+            .find_map(|choice| self.registry_of(choice))
     }
 
     fn unknown_key(&mut self, properties: &Map<String, Value>, item: &Item, path: &str) {
@@ -475,6 +511,7 @@ impl<'c> Typer<'c, '_> {
                 diagnostics: &mut diagnostics,
                 traces: traces.clone(),
                 beside: self.beside.clone(),
+                prefix: self.prefix.clone(),
             };
             let value = inner.value(choice, node, path);
             let traces = inner.traces;

@@ -192,7 +192,7 @@ pub fn decode(bytes: &[u8], layer: u32) -> Result<&str, Box<Diagnostic>> {
                 Code::E0101,
                 start,
                 format!(
-                    "the file has {} bytes; an experiment has at most {MAX_BYTES}",
+                    "the file has {} bytes or more; an experiment has at most {MAX_BYTES}",
                     bytes.len()
                 ),
             )
@@ -254,6 +254,7 @@ fn parse_from(
     let mut options = granit_parser::Options::default();
     options.block_nesting_limit = MAX_DEPTH;
     options.flow_nesting_limit = MAX_DEPTH;
+    options.emit_comments = false;
     let offset = if text[offset..].starts_with('\u{feff}') {
         offset + 3
     } else {
@@ -304,7 +305,11 @@ impl<'t> Builder<'t, '_> {
                         ));
                     }
                     let (event, span) = self.next()?;
-                    root = Some(self.node(event, span, 0)?);
+                    root = Some(if event == Event::DocumentEnd {
+                        Node::new(Data::Null, span)
+                    } else {
+                        self.node(event, span, 0)?
+                    });
                 }
                 Event::StreamEnd => break,
                 _ => {
@@ -356,6 +361,17 @@ impl<'t> Builder<'t, '_> {
                         message
                     },
                 );
+                let line_start = self.text[..at.min(self.text.len())]
+                    .rfind('\n')
+                    .map_or(0, |at| at + 1);
+                let substitution = self.text[line_start..]
+                    .lines()
+                    .next()
+                    .is_some_and(|line| line.contains("${"));
+                if substitution {
+                    diagnostic =
+                        diagnostic.help("inside `{ }` and `[ ]`, quote it: `\"${params.x}\"`");
+                }
                 if tab {
                     diagnostic = diagnostic.help("YAML indents with spaces, never with tabs");
                 }

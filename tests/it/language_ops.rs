@@ -432,13 +432,11 @@ impl Folder {
     }
 
     /// What `reviv check` says, with the folder's name taken out.
-    #[allow(dead_code)]
     pub fn says(&self, name: &str, set: &[&str]) -> String {
         let (_, report) = self.load(name, set);
         self.clean(&report)
     }
 
-    #[allow(dead_code)]
     pub fn clean(&self, report: &Report) -> String {
         let folder = format!("{}/", self.0.path().display());
         report

@@ -1,6 +1,8 @@
 //! One integration test binary, a file per command or promise.
 #![allow(clippy::unwrap_used)] // A test that cannot go on should stop where it is.
 
+mod bad_input;
+mod diagnostics;
 mod egom2p_examples;
 mod evaluation;
 mod metrics;
@@ -9,6 +11,7 @@ mod reconstruction;
 mod recordings_bad;
 mod recordings_golden;
 mod recordings_video;
+mod schema;
 mod shared;
 mod train_mget;
 mod training;

@@ -1,0 +1,225 @@
+//! `reviv plan`: the resolved graph, without running it.
+
+use super::request::{Changes, count, open};
+use super::terminal::{Failure, Terminal};
+use crate::experiment::catalog::Catalog;
+use crate::experiment::plan::{Plan as Planned, PlannedStage, plan};
+use crate::run::{Cache, Key};
+use std::fmt::Write as _;
+use std::path::{Path, PathBuf};
+
+/// Show the resolved graph: what is cached, shapes, parameters, tokens, memory, FLOP
+#[derive(Debug, clap::Args)]
+pub struct Plan {
+    /// The experiment or sweep
+    file: PathBuf,
+    #[command(flatten)]
+    changes: Changes,
+    /// Where runs and their cache are
+    #[arg(long, default_value = "runs", value_name = "DIR")]
+    runs: PathBuf,
+    /// Write JSON to stdout
+    #[arg(long)]
+    json: bool,
+}
+
+impl super::Run for Plan {
+    fn run(self, terminal: &Terminal) -> Result<(), Failure> {
+        let catalog = Catalog::linked();
+        let (experiment, _) = open(&catalog, &self.changes.request(&self.file), terminal)?;
+        let cache = Cache::new(self.runs.join("cache"));
+        let cached = |key: &crate::experiment::ArtifactKey| cache.contains(&Key::from(*key));
+        let planned = plan(&experiment, &cached, &mut hash_file).map_err(Failure::machine)?;
+        if self.json {
+            terminal.json(&planned);
+        } else {
+            terminal.data(render(&planned));
+        }
+        Ok(())
+    }
+}
+
+fn hash_file(path: &Path) -> std::io::Result<blake3::Hash> {
+    let mut hasher = blake3::Hasher::new();
+    hasher.update_reader(std::fs::File::open(path)?)?;
+    Ok(hasher.finalize())
+}
+
+fn render(plan: &Planned) -> String {
+    let mut text = String::new();
+    let to_do = plan.to_do().count();
+    let _ = write!(text, "{}: {}", plan.name, count(plan.stages.len(), "stage"));
+    if plan.cells.len() > 1 {
+        let _ = write!(
+            text,
+            " for {} runs that have {} together, {} of them shared",
+            plan.cells.len(),
+            plan.total,
+            plan.total - plan.stages.len()
+        );
+    }
+    let _ = writeln!(
+        text,
+        "; {} cached, {to_do} to do\n",
+        plan.stages.len() - to_do
+    );
+    let name = plan.stages.iter().map(|s| s.name.len()).max().unwrap_or(0);
+    let op = plan.stages.iter().map(|s| s.op.len()).max().unwrap_or(0);
+    for stage in &plan.stages {
+        let state = if stage.cached { "cached" } else { "to do" };
+        let _ = writeln!(
+            text,
+            "{:name$}  {:op$}  {state:6}  {}  {}",
+            stage.name,
+            stage.op,
+            &stage.key[..8],
+            users(plan, stage)
+        );
+        details(&mut text, stage);
+    }
+    let mut totals = Vec::new();
+    if plan.flop() > 0.0 {
+        totals.push(format!("{} FLOP", scaled(plan.flop())));
+    }
+    if let Some(memory) = plan.memory() {
+        totals.push(format!("peak memory {}", bytes(memory)));
+    }
+    if let Some(seconds) = plan.seconds().filter(|_| to_do > 0) {
+        totals.push(format!("about {}", duration(seconds)));
+    }
+    if !totals.is_empty() {
+        let _ = writeln!(text, "\nto do: {}", totals.join(", "));
+    }
+    text
+}
+
+/// Which runs need a stage.
+fn users(plan: &Planned, stage: &PlannedStage) -> String {
+    match stage.cells.len() {
+        _ if plan.cells.len() == 1 => String::new(),
+        n if n == plan.cells.len() => "all runs".to_owned(),
+        n if n > 4 => format!("{n} runs"),
+        _ => {
+            let names: Vec<&str> = stage
+                .cells
+                .iter()
+                .map(|&i| plan.cells[i].as_str())
+                .collect();
+            names.join(" ")
+        }
+    }
+}
+
+fn details(text: &mut String, stage: &PlannedStage) {
+    let plan = &stage.plan;
+    if let Some((amount, unit)) = &plan.work {
+        let _ = writeln!(text, "    {} {unit}", grouped(*amount));
+    }
+    for (name, shape) in &plan.shapes {
+        let shape: Vec<String> = shape.iter().map(ToString::to_string).collect();
+        let _ = writeln!(text, "    {name} [{}]", shape.join(", "));
+    }
+    if let Some(parameters) = plan.parameters {
+        let parts: Vec<String> = plan
+            .parameter_parts
+            .iter()
+            .map(|(name, count)| format!("{name} {}", grouped(*count)))
+            .collect();
+        let parts = if parts.is_empty() {
+            String::new()
+        } else {
+            format!(": {}", parts.join(", "))
+        };
+        let _ = writeln!(text, "    {} parameters{parts}", grouped(parameters));
+    }
+    let width = plan
+        .tokens
+        .iter()
+        .map(|t| t.modality.len())
+        .max()
+        .unwrap_or(0);
+    for tokens in &plan.tokens {
+        let _ = write!(
+            text,
+            "    {:width$}  {:>6} tokens of {:>6}",
+            tokens.modality,
+            grouped(tokens.tokens),
+            grouped(tokens.vocabulary)
+        );
+        if let (Some(input), Some(target)) = (tokens.mean_input, tokens.mean_target) {
+            let _ = write!(text, ", masking shows {input:.1} and asks for {target:.1}");
+        }
+        text.push('\n');
+    }
+    let mut costs = Vec::new();
+    if let Some(memory) = plan.memory {
+        costs.push(format!("peak memory {}", bytes(memory)));
+    }
+    if let Some(disk) = plan.disk {
+        costs.push(format!("{} on disk", bytes(disk)));
+    }
+    if let Some(flop) = plan.flop {
+        costs.push(format!("{} FLOP", scaled(flop)));
+    }
+    if let Some(seconds) = plan.seconds {
+        costs.push(format!("about {}", duration(seconds)));
+    }
+    if !costs.is_empty() {
+        let _ = writeln!(text, "    {}", costs.join(", "));
+    }
+    for line in &plan.lines {
+        let _ = writeln!(text, "    {line}");
+    }
+}
+
+/// `127 272 960`.
+fn grouped(number: u64) -> String {
+    let digits = number.to_string();
+    let mut text = String::new();
+    for (index, digit) in digits.chars().enumerate() {
+        if index > 0 && (digits.len() - index).is_multiple_of(3) {
+            text.push(' ');
+        }
+        text.push(digit);
+    }
+    text
+}
+
+/// `1.2 T`.
+fn scaled(number: f64) -> String {
+    let units = [
+        (1e18, "E"),
+        (1e15, "P"),
+        (1e12, "T"),
+        (1e9, "G"),
+        (1e6, "M"),
+    ];
+    units.iter().find(|(size, _)| number >= *size).map_or_else(
+        || format!("{number:.0}"),
+        |(size, unit)| format!("{:.1} {unit}", number / size),
+    )
+}
+
+/// `1.2 GiB`.
+fn bytes(number: u64) -> String {
+    let units = [
+        (1u64 << 40, "TiB"),
+        (1 << 30, "GiB"),
+        (1 << 20, "MiB"),
+        (1 << 10, "KiB"),
+    ];
+    units.iter().find(|(size, _)| number >= *size).map_or_else(
+        || format!("{number} B"),
+        |(size, unit)| format!("{:.1} {unit}", number as f64 / *size as f64),
+    )
+}
+
+/// `2 h 5 min`.
+fn duration(seconds: f64) -> String {
+    let whole = seconds.round() as u64;
+    match whole {
+        0..60 => format!("{whole} s"),
+        60..3600 => format!("{} min {} s", whole / 60, whole % 60),
+        _ => format!("{} h {} min", whole / 3600, whole % 3600 / 60),
+    }
+}

@@ -1,0 +1,104 @@
+//! What running an experiment would do: every different stage once, what its cells share, what is cached already.
+
+use super::artifact::{ArtifactKind, Description};
+use super::graph::{ArtifactKey, Experiment};
+use super::stage::StagePlan;
+use serde::Serialize;
+use std::collections::BTreeMap;
+use std::path::Path;
+
+/// A planned experiment.
+#[derive(Debug, Clone, Serialize)]
+pub struct Plan {
+    pub name: String,
+    /// Labels of the cells: arm and seed.
+    pub cells: Vec<String>,
+    /// Every different piece of work, in an order in which it can be done.
+    pub stages: Vec<PlannedStage>,
+    /// Stages of all cells together; the difference to `stages` is what they share.
+    pub total: usize,
+}
+
+/// One piece of work.
+#[derive(Debug, Clone, Serialize)]
+pub struct PlannedStage {
+    /// The stage's name in the experiment.
+    pub name: String,
+    pub op: &'static str,
+    pub makes: ArtifactKind,
+    /// The artifact's address.
+    pub key: String,
+    pub cached: bool,
+    /// The cells that use it, as indices into [`Plan::cells`].
+    pub cells: Vec<usize>,
+    pub description: Description,
+    pub plan: StagePlan,
+}
+
+impl Plan {
+    /// Pieces of work that are not cached.
+    pub fn to_do(&self) -> impl Iterator<Item = &PlannedStage> {
+        self.stages.iter().filter(|stage| !stage.cached)
+    }
+
+    /// Floating point operations of what is to do, as far as they are known.
+    pub fn flop(&self) -> f64 {
+        self.to_do().filter_map(|stage| stage.plan.flop).sum()
+    }
+
+    /// The largest peak memory of what is to do, in bytes.
+    pub fn memory(&self) -> Option<u64> {
+        self.to_do().filter_map(|stage| stage.plan.memory).max()
+    }
+
+    /// Seconds of what is to do, where every stage knows its own.
+    pub fn seconds(&self) -> Option<f64> {
+        self.to_do().map(|stage| stage.plan.seconds).sum()
+    }
+}
+
+/// Plans an experiment: no compute, no allocation of a model.
+///
+/// `cached` says whether an artifact is there; `hash_file` hashes outside files.
+///
+/// # Errors
+/// When an outside file cannot be read.
+pub fn plan(
+    experiment: &Experiment,
+    cached: &dyn Fn(&ArtifactKey) -> bool,
+    hash_file: &mut dyn FnMut(&Path) -> std::io::Result<blake3::Hash>,
+) -> std::io::Result<Plan> {
+    let mut stages: Vec<PlannedStage> = Vec::new();
+    let mut seen: BTreeMap<String, usize> = BTreeMap::new();
+    let mut total = 0;
+    for (index, cell) in experiment.cells.iter().enumerate() {
+        let keys = cell.graph.keys(hash_file)?;
+        for (stage, key) in cell.graph.stages.iter().zip(keys) {
+            total += 1;
+            let address = key.to_string();
+            if let Some(&place) = seen.get(&address) {
+                if !stages[place].cells.contains(&index) {
+                    stages[place].cells.push(index);
+                }
+                continue;
+            }
+            seen.insert(address.clone(), stages.len());
+            stages.push(PlannedStage {
+                name: stage.name.clone(),
+                op: stage.op.name(),
+                makes: stage.op.output(),
+                key: address,
+                cached: cached(&key),
+                cells: vec![index],
+                description: stage.description.clone(),
+                plan: cell.graph.plan(stage),
+            });
+        }
+    }
+    Ok(Plan {
+        name: experiment.name.clone(),
+        cells: experiment.cells.iter().map(super::Cell::label).collect(),
+        stages,
+        total,
+    })
+}

@@ -1,0 +1,230 @@
+//! Which layer set a value, and what it replaced.
+
+use super::catalog::Catalog;
+use super::docs;
+use super::graph::{Cell, Experiment, Stage};
+use super::names;
+use super::source::Origin;
+use serde::Serialize;
+use serde_json::Value;
+use std::fmt::Write as _;
+
+/// The history of one value, newest first.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Answer {
+    pub key: String,
+    pub value: String,
+    pub about: String,
+    pub chain: Vec<Link>,
+}
+
+/// A layer that gave a value.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Link {
+    pub value: String,
+    /// `experiments/tiny.yaml:11`.
+    pub place: String,
+    /// Which layer that is, in words.
+    pub layer: String,
+}
+
+/// Explains a key (`stages.mget.steps`, or without `stages.`), or all keys of a stage.
+///
+/// # Errors
+/// Words and a way out, when there is no such key.
+pub fn explain(
+    catalog: &Catalog,
+    experiment: &Experiment,
+    arm: Option<&str>,
+    key: &str,
+) -> Result<Vec<Answer>, (String, String)> {
+    let cell = match arm {
+        None => experiment.cells.first(),
+        Some(arm) => experiment.cells.iter().find(|cell| cell.arm == arm),
+    };
+    let Some(cell) = cell else {
+        let mut arms: Vec<&str> = experiment.cells.iter().map(|c| c.arm.as_str()).collect();
+        arms.dedup();
+        let arm = arm.unwrap_or("");
+        return Err((
+            format!("there is no arm `{arm}`"),
+            names::suggest(arm, &arms).unwrap_or_default(),
+        ));
+    };
+    let short = key.strip_prefix("stages.").unwrap_or(key);
+    let stage = cell
+        .graph
+        .stages
+        .iter()
+        .filter(|stage| {
+            short
+                .strip_prefix(&stage.name)
+                .is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
+        })
+        .max_by_key(|stage| stage.name.len());
+    let Some(stage) = stage else {
+        let known: Vec<&str> = cell.graph.stages.iter().map(|s| s.name.as_str()).collect();
+        let wrong = short.split('.').next().unwrap_or(short);
+        return Err((
+            format!("`{key}` is in no stage"),
+            names::suggest(wrong, &known).unwrap_or_default(),
+        ));
+    };
+    let rest = short[stage.name.len()..].trim_start_matches('.');
+    let mut values = values_of(cell, stage);
+    if !rest.is_empty() {
+        let inside = format!("{rest}.");
+        let chosen: Vec<(String, String)> = values
+            .iter()
+            .filter(|(name, _)| name == rest || name.starts_with(&inside))
+            .cloned()
+            .collect();
+        if chosen.is_empty() {
+            let known: Vec<&str> = values.iter().map(|(name, _)| name.as_str()).collect();
+            return Err((
+                format!("stage `{}` has no `{rest}`", stage.name),
+                names::suggest(rest, &known).unwrap_or_default(),
+            ));
+        }
+        values = chosen;
+    }
+    let settings = catalog
+        .schema(stage.op.name())
+        .map(|schema| docs::settings(catalog, schema))
+        .unwrap_or_default();
+    Ok(values
+        .into_iter()
+        .map(|(name, value)| {
+            let about = settings
+                .iter()
+                .find(|setting| setting.key == name)
+                .map(|setting| setting.about.clone())
+                .unwrap_or_default();
+            answer(experiment, cell, stage, &name, value, about)
+        })
+        .collect())
+}
+
+fn answer(
+    experiment: &Experiment,
+    cell: &Cell,
+    stage: &Stage,
+    name: &str,
+    value: String,
+    about: String,
+) -> Answer {
+    let mut chain = Vec::new();
+    if let Some(trace) = stage.traces.get(name) {
+        let places = std::iter::once((trace.span, value.clone())).chain(trace.before.clone());
+        for (span, value) in places {
+            chain.push(Link {
+                value,
+                place: experiment.sources.cite(span),
+                layer: layer(experiment, cell, span.layer),
+            });
+        }
+    } else {
+        let layer = match name {
+            "seed" => "the seed of the run".to_owned(),
+            "op" => "the stage".to_owned(),
+            _ => format!("default of op `{}`", stage.op.name()),
+        };
+        chain.push(Link {
+            value: value.clone(),
+            place: String::new(),
+            layer,
+        });
+    }
+    Answer {
+        key: format!("stages.{}.{name}", stage.name),
+        value,
+        about,
+        chain,
+    }
+}
+
+fn layer(experiment: &Experiment, cell: &Cell, layer: u32) -> String {
+    let Some(source) = experiment.sources.get(layer) else {
+        return String::new();
+    };
+    match &source.origin {
+        Origin::File if experiment.sweep && !cell.arm.is_empty() => format!("arm `{}`", cell.arm),
+        Origin::File => "the file".to_owned(),
+        Origin::Extended(_) if experiment.sweep => "the base".to_owned(),
+        Origin::Extended(by) => format!("extended by {by}"),
+        Origin::Imported(_) => "another experiment".to_owned(),
+        Origin::Registry => "the registry".to_owned(),
+        Origin::Set => "the command line".to_owned(),
+        Origin::Environment => "the environment".to_owned(),
+    }
+}
+
+/// Every setting and edge of a stage as text.
+fn values_of(cell: &Cell, stage: &Stage) -> Vec<(String, String)> {
+    let mut values = vec![("op".to_owned(), stage.op.name().to_owned())];
+    for edge in &stage.edges {
+        let names: Vec<&str> = edge
+            .from
+            .iter()
+            .map(|&index| cell.graph.stages[index].name.as_str())
+            .collect();
+        values.push((edge.port.to_owned(), names.join(", ")));
+    }
+    flatten("", &stage.settings, &mut values);
+    values.push(("seed".to_owned(), stage.seed.to_string()));
+    values
+}
+
+fn flatten(path: &str, value: &Value, into: &mut Vec<(String, String)>) {
+    let inner = |key: &str| {
+        if path.is_empty() {
+            key.to_owned()
+        } else {
+            format!("{path}.{key}")
+        }
+    };
+    match value {
+        Value::Object(map) if !map.is_empty() => {
+            for (key, value) in map {
+                flatten(&inner(key), value, into);
+            }
+        }
+        Value::Array(items) if items.iter().any(Value::is_object) => {
+            for (index, value) in items.iter().enumerate() {
+                flatten(&inner(&index.to_string()), value, into);
+            }
+        }
+        Value::Object(_) if path.is_empty() => {}
+        Value::String(text) => into.push((path.to_owned(), text.clone())),
+        other => into.push((path.to_owned(), other.to_string())),
+    }
+}
+
+/// For people.
+pub fn render(answers: &[Answer]) -> String {
+    let mut text = String::new();
+    for answer in answers {
+        let _ = writeln!(text, "{} = {}", answer.key, answer.value);
+        if !answer.about.is_empty() {
+            let _ = writeln!(text, "  # {}", answer.about);
+        }
+        let width = |get: fn(&Link) -> &str| {
+            answer
+                .chain
+                .iter()
+                .map(|link| get(link).chars().count())
+                .max()
+                .unwrap_or(0)
+        };
+        let (value, place) = (width(|link| &link.value), width(|link| &link.place));
+        for (index, link) in answer.chain.iter().enumerate() {
+            let word = if index == 0 { "set by  " } else { "was     " };
+            let line = format!(
+                "  {word}{:value$}  {:place$}  {}",
+                link.value, link.place, link.layer
+            );
+            let _ = writeln!(text, "{}", line.trim_end());
+        }
+    }
+    text
+}

@@ -1,0 +1,72 @@
+//! The schema for editors: what is checked in is what the binary writes, and it takes what the language takes.
+
+use reviv::experiment::catalog::Catalog;
+use reviv::experiment::schema;
+use std::path::Path;
+
+#[test]
+fn the_checked_in_schema_is_current() {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("registry/schema.json");
+    let checked_in = std::fs::read_to_string(&path).unwrap_or_default();
+    assert!(
+        checked_in == schema::text(&Catalog::linked()),
+        "registry/schema.json is stale: run `cargo run -- schema`"
+    );
+}
+
+#[test]
+fn the_schema_knows_ops_entries_and_settings() {
+    let schema = schema::schema(&crate::language_ops::catalog());
+    let rules = schema["$defs"]["stage"]["allOf"].as_array().unwrap();
+    let mget = rules
+        .iter()
+        .find(|rule| rule["if"]["properties"]["op"]["const"] == "train_mget")
+        .unwrap();
+    let properties = &mget["then"]["properties"];
+    assert_eq!(properties["tokenizers"]["type"], "array");
+    assert_eq!(
+        properties["masking"]["anyOf"][0]["enum"],
+        serde_json::json!(["dirichlet", "dirichlet_mixture", "uniform"])
+    );
+    assert!(properties["masking"]["anyOf"][2]["properties"]["alpha"].is_object());
+    assert_eq!(mget["then"]["additionalProperties"], false);
+    // Nothing of the language's own marks is left for an editor to stumble over.
+    assert!(!schema.to_string().contains("x-registry"));
+}
+
+#[test]
+fn every_shipped_entry_is_sound() {
+    let catalog = Catalog::linked();
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    for entry in reviv::experiment::registry::Registry::new(&catalog, None).list(None) {
+        let path = root.join(entry.place.trim_end_matches(" (built in)"));
+        let request = reviv::experiment::load::Request {
+            path,
+            ..Default::default()
+        };
+        let (_, report) = reviv::experiment::load::check(&catalog, &request);
+        assert!(!report.failed(), "{}", report.render(false));
+        assert!(!entry.about.is_empty(), "{} has no `about`", entry.place);
+    }
+}
+
+#[test]
+fn every_shipped_experiment_is_sound() {
+    let catalog = Catalog::linked();
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    for (path, _) in catalog.experiments() {
+        let request = reviv::experiment::load::Request {
+            path: root.join(path),
+            ..Default::default()
+        };
+        let (_, report) = reviv::experiment::load::check(&catalog, &request);
+        let wrong: Vec<_> = report
+            .diagnostics
+            .iter()
+            // Data sets and videos are the user's; everything else must be right as shipped.
+            .filter(|d| !d.code.is_warning() && d.code != reviv::experiment::Code::E0601)
+            .filter(|d| d.code != reviv::experiment::Code::E0204)
+            .collect();
+        assert!(wrong.is_empty(), "{}", report.render(false));
+    }
+}
