@@ -4,8 +4,6 @@ use crate::decoding::DecodingSettings;
 use crate::evaluation::published::Published;
 use crate::evaluation::suite::Suite;
 use crate::experiment::{Kind, KindEntry};
-use crate::masking::MaskingSettings;
-use crate::mget::Size;
 
 impl Kind for DecodingSettings {
     const KIND: &'static str = "decoding";
@@ -25,15 +23,3 @@ impl Kind for Published {
         "Rows of published tables with their conditions: context, never compared.";
 }
 inventory::submit! { KindEntry::of::<Published>() }
-
-impl Kind for MaskingSettings {
-    const KIND: &'static str = "masking";
-    const ABOUT: &'static str = "Which tokens are seen and which are asked for (Sec. 4.3).";
-}
-inventory::submit! { KindEntry::of::<MaskingSettings>() }
-
-impl Kind for Size {
-    const KIND: &'static str = "size";
-    const ABOUT: &'static str = "Depth and width of MGET (Supp. B).";
-}
-inventory::submit! { KindEntry::of::<Size>() }
