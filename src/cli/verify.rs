@@ -1,0 +1,62 @@
+//! `reviv verify`: does a run still hold?
+
+use super::run::{Place, find, interruptible, progress, tell};
+use super::terminal::{Failure, Terminal};
+use crate::run::verify::{Redo, Verdict, verify};
+
+/// Re-hash a run's inputs and artifacts, redo its work from a checkpoint, and demand identical bytes
+#[derive(Debug, clap::Args)]
+pub struct Verify {
+    /// A run: its path, its name, or enough of it
+    #[arg(value_name = "RUN")]
+    run: String,
+    /// Only hash, redo nothing
+    #[arg(long, conflicts_with = "all")]
+    hash_only: bool,
+    /// Redo everything, also long stages without a checkpoint
+    #[arg(long)]
+    all: bool,
+    /// Write the checks as JSON to stdout
+    #[arg(long)]
+    json: bool,
+    #[command(flatten)]
+    place: Place,
+}
+
+impl super::Run for Verify {
+    fn run(self, terminal: &Terminal) -> Result<(), Failure> {
+        let run = find(terminal, &self.place.runs, &self.run)?;
+        let redo = match (self.hash_only, self.all) {
+            (true, _) => Redo::Nothing,
+            (_, true) => Redo::All,
+            _ => Redo::Quick,
+        };
+        let interrupt = interruptible(terminal)?;
+        let checks = verify(&run, redo, &progress(terminal), &interrupt)
+            .map_err(|error| tell(terminal, &error))?;
+        if self.json {
+            terminal.json(&checks);
+        } else {
+            for check in &checks {
+                let word = match check.verdict {
+                    Verdict::Same => "same",
+                    Verdict::Changed => "CHANGED",
+                    Verdict::Skipped => "skipped",
+                };
+                terminal.data(format_args!("{word:8}{}: {}\n", check.what, check.detail));
+            }
+        }
+        let changed = checks
+            .iter()
+            .filter(|check| check.verdict == Verdict::Changed)
+            .count();
+        if changed == 0 {
+            return Ok(());
+        }
+        terminal.note(format_args!(
+            "error[E0602]: {changed} of {} checks failed\n",
+            checks.len()
+        ));
+        Err(Failure::Ended(1))
+    }
+}
