@@ -4,13 +4,17 @@
 //! `commands!`. Its doc comment is its help.
 
 mod check;
+mod compare;
 mod completions;
+mod gc;
 mod list;
 mod plan;
 mod request;
+mod run;
 mod schema;
 mod show;
 mod terminal;
+mod verify;
 mod why;
 
 use clap::{CommandFactory as _, Parser as _};
@@ -46,11 +50,15 @@ macro_rules! commands {
 
 // In the order of `reviv --help`.
 commands! {
+    run::Run,
     check::Check,
     plan::Plan,
     why::Why,
     list::List,
     show::Show,
+    compare::Compare,
+    verify::Verify,
+    gc::Gc,
     schema::Schema,
     completions::Completions,
 }

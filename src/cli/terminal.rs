@@ -13,6 +13,8 @@ pub enum Failure {
     Input { message: String, help: String },
     /// The machine, or a bug.
     Machine(String),
+    /// Anything that has been reported already and ends the process with this code.
+    Ended(u8),
 }
 
 impl Failure {
@@ -73,6 +75,7 @@ impl Terminal {
     pub fn fail(&self, failure: Failure) -> ExitCode {
         match failure {
             Failure::Reported => ExitCode::from(1),
+            Failure::Ended(code) => ExitCode::from(code),
             Failure::Input { message, help } => {
                 self.note(format_args!("error: {message}\n"));
                 if !help.is_empty() {

@@ -1,0 +1,237 @@
+//! `reviv compare`: runs, arms and seeds in one table, paired on common clips; or two trajectory files, as `evo` does it.
+
+use super::terminal::{Failure, Terminal};
+use crate::evaluation::compare::{CompareSettings, Entrant, compare};
+use crate::evaluation::render::{Format, render};
+use crate::evaluation::scores::{FILE, Scores};
+use crate::evaluation::trajectory::TrajectoryErrors;
+use crate::evaluation::tum::{self, TimedPoses};
+use crate::geometry::alignment::Freedom;
+use crate::run::RunDirectory;
+use crate::run::execute::cache_of;
+use crate::run::files::read_json;
+use crate::run::schedule::Schedule;
+use std::path::{Path, PathBuf};
+
+/// Put the scores of runs side by side, with intervals and paired differences
+///
+/// Arms of a sweep are rows, their seeds are repetitions. A scores file (or a folder with one) is a row, too. With
+/// `--trajectory`, compares two TUM trajectory files instead and prints the numbers that `evo_ape` and `evo_rpe` print.
+#[derive(Debug, clap::Args)]
+pub struct Compare {
+    /// Run names, run directories, or scores files
+    #[arg(value_name = "RUN", required_unless_present = "trajectory")]
+    runs: Vec<String>,
+    /// The row that all others are tested against
+    #[arg(long, value_name = "ROW")]
+    baseline: Option<String>,
+    /// Columns, in this order; `depth.abs_rel` stands for all its spaces
+    #[arg(long, value_delimiter = ',', value_name = "COLUMN")]
+    columns: Vec<String>,
+    /// Confidence level of the intervals
+    #[arg(long, default_value_t = 0.95, value_name = "SHARE")]
+    level: f64,
+    /// How to write the table
+    #[arg(long, default_value = "term", value_parser = ["term", "md", "latex", "csv"])]
+    format: String,
+    /// Two trajectory files, `timestamp tx ty tz qx qy qz qw` per line
+    #[arg(long, num_args = 2, value_names = ["REFERENCE", "ESTIMATE"], conflicts_with = "runs")]
+    trajectory: Option<Vec<PathBuf>>,
+    /// Seconds within which two poses of trajectories count as simultaneous
+    #[arg(long, default_value_t = tum::MAX_DIFFERENCE, value_name = "SECONDS", requires = "trajectory")]
+    max_difference: f64,
+    /// Where runs are
+    #[arg(long = "runs-in", default_value = "runs", value_name = "DIR")]
+    place: PathBuf,
+    /// Write JSON to stdout
+    #[arg(long)]
+    json: bool,
+}
+
+impl super::Run for Compare {
+    fn run(self, terminal: &Terminal) -> Result<(), Failure> {
+        if let Some([reference, estimate]) = self.trajectory.as_deref() {
+            return self.trajectories(terminal, reference, estimate);
+        }
+        let mut entrants: Vec<Entrant> = Vec::new();
+        for name in &self.runs {
+            let mut found = entrants_of(name, &self.place)?;
+            for entrant in &mut found {
+                if entrants.iter().any(|e| e.label == entrant.label) {
+                    entrant.label = format!("{name}/{}", entrant.label);
+                }
+            }
+            entrants.extend(found);
+        }
+        let mut settings = CompareSettings {
+            baseline: self.baseline,
+            columns: self.columns,
+            ..CompareSettings::default()
+        };
+        settings.interval.level = self.level;
+        let table = compare("", &entrants, &settings, None).map_err(|error| {
+            Failure::input(error.to_string(), "`reviv list runs` shows all runs")
+        })?;
+        if self.json {
+            terminal.json(&table);
+        } else {
+            let format = Format::named(&self.format).unwrap_or(Format::Terminal);
+            terminal.data(render(&table, format));
+        }
+        Ok(())
+    }
+}
+
+impl Compare {
+    fn trajectories(
+        &self,
+        terminal: &Terminal,
+        reference: &Path,
+        estimate: &Path,
+    ) -> Result<(), Failure> {
+        let read = |path: &Path| {
+            tum::read_tum(path).map_err(|error| {
+                Failure::input(
+                    error.to_string(),
+                    "a TUM trajectory has lines `timestamp tx ty tz qx qy qz qw`",
+                )
+            })
+        };
+        let (reference, estimate): (TimedPoses, TimedPoses) = (read(reference)?, read(estimate)?);
+        let errors = |freedom| {
+            tum::compare(&reference, &estimate, self.max_difference, freedom)
+                .map_err(|error| Failure::input(error.to_string(), "see `--max-difference`"))
+        };
+        let (rigid, similar) = (errors(Freedom::Rigid)?, errors(Freedom::Similarity)?);
+        if self.json {
+            terminal.json(&serde_json::json!({
+                "pairs": rigid.n_poses,
+                "max_diff_s": self.max_difference,
+                "se3": numbers(&rigid),
+                "sim3": numbers(&similar),
+                "degenerate": similar.degenerate,
+            }));
+            return Ok(());
+        }
+        let mut text = format!(
+            "{} simultaneous poses (within {} s)\n\n",
+            rigid.n_poses, self.max_difference
+        );
+        text += &format!(
+            "{:<34}{:>22}{:>22}\n",
+            "", "rigid (SE3)", "similarity (Sim3)"
+        );
+        for (name, of) in ROWS {
+            let show = |errors: &TrajectoryErrors| {
+                of(errors).map_or_else(|| "-".to_owned(), |v| format!("{v:.15}"))
+            };
+            text += &format!("{name:<34}{:>22}{:>22}\n", show(&rigid), show(&similar));
+        }
+        if similar.degenerate {
+            text += "\ndegenerate: the alignment is not unique; do not compare these numbers\n";
+        }
+        terminal.data(text);
+        Ok(())
+    }
+}
+
+type Of = fn(&TrajectoryErrors) -> Option<f64>;
+
+/// What `evo_ape` and `evo_rpe` print as `rmse` and `mean`.
+const ROWS: [(&str, Of); 7] = [
+    ("ATE rmse (m)", |e| e.ate_rmse),
+    ("ATE mean (m)", |e| e.ate_mean),
+    ("RPE translation rmse (m)", |e| e.rte_rmse),
+    ("RPE translation mean (m)", |e| e.rte_mean),
+    ("RPE rotation rmse (deg)", |e| e.rre_rmse),
+    ("RPE rotation mean (deg)", |e| e.rre_mean),
+    ("scale of the alignment", |e| e.alignment.map(|a| a.scale)),
+];
+
+fn numbers(errors: &TrajectoryErrors) -> serde_json::Value {
+    serde_json::json!({
+        "ate_rmse_m": errors.ate_rmse,
+        "ate_mean_m": errors.ate_mean,
+        "rpe_trans_m_rmse": errors.rte_rmse,
+        "rpe_trans_m_mean": errors.rte_mean,
+        "rpe_rot_deg_rmse": errors.rre_rmse,
+        "rpe_rot_deg_mean": errors.rre_mean,
+        "scale": errors.alignment.map(|a| a.scale),
+    })
+}
+
+/// The rows that `name` stands for: a scores file, a folder with one, or a run.
+fn entrants_of(name: &str, runs: &Path) -> Result<Vec<Entrant>, Failure> {
+    let path = Path::new(name);
+    let read = |path: &Path| {
+        Scores::read(path)
+            .map_err(|error| Failure::input(error.to_string(), "was it written by `op: evaluate`?"))
+    };
+    if path.is_file() || path.join(FILE).is_file() {
+        let scores = read(path)?;
+        return Ok(vec![Entrant {
+            label: scores.system.clone(),
+            seeds: vec![scores],
+        }]);
+    }
+    let run =
+        RunDirectory::named(runs, name).map_err(|error| Failure::input(error.to_string(), ""))?;
+    let schedule: Schedule = read_json(&run.path().join("plan.json"))
+        .map_err(|error| Failure::input(error.to_string(), ""))?;
+    let cache = cache_of(run.runs());
+    let is_scores = |key| {
+        schedule
+            .works
+            .iter()
+            .any(|work| work.key == key && work.kind == "scores")
+    };
+    let mut entrants: Vec<Entrant> = Vec::new();
+    let mut missing = 0;
+    for cell in &schedule.cells {
+        let scored: Vec<_> = cell
+            .stages
+            .iter()
+            .filter(|(_, key)| is_scores(*key))
+            .collect();
+        for (stage, key) in &scored {
+            let arm = if schedule.sweep {
+                cell.arm.clone()
+            } else {
+                schedule.name.clone()
+            };
+            let label = if scored.len() > 1 {
+                format!("{arm}/{stage}")
+            } else {
+                arm
+            };
+            let folder = cache.path(key);
+            if !folder.join(FILE).is_file() {
+                missing += 1;
+                continue;
+            }
+            let scores = read(&folder)?;
+            match entrants.iter_mut().find(|e| e.label == label) {
+                Some(entrant) => entrant.seeds.push(scores),
+                None => entrants.push(Entrant {
+                    label,
+                    seeds: vec![scores],
+                }),
+            }
+        }
+    }
+    if entrants.is_empty() {
+        let (message, help) = if missing > 0 {
+            (
+                format!("run `{name}` has not finished its scores"),
+                format!("continue it with `reviv run {}`", schedule.name),
+            )
+        } else {
+            (
+                format!("run `{name}` has no scores"),
+                "add a stage with `op: evaluate`".to_owned(),
+            )
+        };
+        return Err(Failure::input(message, help));
+    }
+    Ok(entrants)
+}
