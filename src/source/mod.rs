@@ -9,6 +9,7 @@
 //! * [`aria`]: recordings of Project Aria glasses; [`umetrack`]: hands from joint angles
 //! * one file per data set: [`adt`], [`hot3d`], [`mps`], [`neutral`] (the folder format that any data set can be written
 //!   as), [`egom2p`] (the ancestors' layout)
+//! * [`world`]: the built-in synthetic world
 //! * [`dataset`] (many recordings), [`mixture`] (many sources), [`open`] (whatever a path holds), [`convert`] (into shards)
 //!
 //! A further data set is one file that fills a [`recording::Recording`], and one line in [`open::Dataset`].
@@ -31,6 +32,7 @@ mod resize;
 pub mod track;
 pub mod umetrack;
 pub mod video;
+pub mod world;
 
 pub use error::SourceError;
 

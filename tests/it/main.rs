@@ -26,3 +26,4 @@ mod run;
 mod tensorboard;
 mod view;
 mod vq_structure;
+mod world;
