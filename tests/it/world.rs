@@ -86,15 +86,6 @@ fn a_foot_on_the_floor_slides_less_than_two_centimetres() {
     assert!(standing > 8000, "{standing}");
 }
 
-trait Horizontal {
-    fn xy(&self) -> nalgebra::Vector2<f64>;
-}
-impl Horizontal for nalgebra::Vector3<f64> {
-    fn xy(&self) -> nalgebra::Vector2<f64> {
-        nalgebra::Vector2::new(self.x, self.y)
-    }
-}
-
 /// The angle between two bones at a joint, degrees; 180 is straight.
 fn angle(a: &Point3<f64>, middle: &Point3<f64>, b: &Point3<f64>) -> f64 {
     (a - middle).angle(&(b - middle)).to_degrees()
@@ -137,7 +128,7 @@ fn joints_stay_in_human_range() {
                     "{index} {t} the leg reaches the foot"
                 );
             }
-            let up = |T: &Isometry3<f64>| T.rotation * nalgebra::Vector3::z();
+            let up = |pose: &Isometry3<f64>| pose.rotation * nalgebra::Vector3::z();
             let neck = up(&trunk.T_world_head)
                 .angle(&up(&trunk.T_world_chest))
                 .to_degrees();

@@ -1,0 +1,409 @@
+//! WebDataset tar shards: one folder per modality, identical stems, as the ancestors of this project lay them out.
+//!
+//! ```text
+//! root/<modality>/<data set>/shard-000000.tar        clips: <id>.npz
+//! root/<modality>/<data set>/token/shard-000000.tar  tokens: <id>.npz with `arr_0`
+//! ```
+//!
+//! A sample that lacks a modality has no member in that modality's tar. Opening shards reads headers only; samples are read
+//! one at a time when asked for, in any order, so memory does not grow with the data. Tars are untrusted: a size is compared
+//! with the file before anything is allocated.
+
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io::{BufWriter, Read, Seek, SeekFrom};
+use std::path::{Path, PathBuf};
+
+/// Samples per shard of tokens, as in the released data.
+pub const TOKENS_PER_SHARD: usize = 1000;
+
+/// Why shards cannot be read or written.
+#[derive(Debug, thiserror::Error)]
+pub enum ShardError {
+    #[error("{}: {error}", path.display())]
+    Io {
+        path: PathBuf,
+        #[source]
+        error: std::io::Error,
+    },
+    #[error("{}: member `{member}`: {reason}", path.display())]
+    Member {
+        path: PathBuf,
+        member: String,
+        reason: String,
+    },
+    #[error("{}: byte {offset}: {reason}", path.display())]
+    Tar {
+        path: PathBuf,
+        offset: u64,
+        reason: String,
+    },
+    #[error("{}: no shards below it", .0.display())]
+    Empty(PathBuf),
+    #[error("no sample number {index}; there are {count}")]
+    NoSample { index: usize, count: usize },
+}
+
+fn io(path: &Path) -> impl FnOnce(std::io::Error) -> ShardError + '_ {
+    move |error| ShardError::Io {
+        path: path.to_owned(),
+        error,
+    }
+}
+
+/// Writes one shard of every modality; nothing is visible under its final name before [`ShardWriter::finish`].
+pub struct ShardWriter {
+    root: PathBuf,
+    number: u32,
+    open: BTreeMap<String, (PathBuf, tar::Builder<BufWriter<File>>)>,
+}
+
+impl ShardWriter {
+    /// Shard `number` below `root`.
+    pub fn new(root: &Path, number: u32) -> Self {
+        Self {
+            root: root.to_owned(),
+            number,
+            open: BTreeMap::new(),
+        }
+    }
+
+    /// Adds a member to the tar in `folder` (`camera/world`, `camera/world/token`).
+    ///
+    /// # Errors
+    /// When `stem` is empty, absolute or leaves the folder, or the disk refuses.
+    pub fn add(&mut self, folder: &str, stem: &str, bytes: &[u8]) -> Result<(), ShardError> {
+        let clean =
+            |part: &str| !part.is_empty() && part != "." && part != ".." && !part.contains('\\');
+        if !stem.split('/').all(clean) || !folder.split('/').all(clean) {
+            return Err(ShardError::Member {
+                path: self.root.join(folder),
+                member: stem.to_owned(),
+                reason: "not a relative path".to_owned(),
+            });
+        }
+        if !self.open.contains_key(folder) {
+            let place = self.root.join(folder);
+            std::fs::create_dir_all(&place).map_err(io(&place))?;
+            let path = place.join(format!("shard-{:06}.tar", self.number));
+            let temporary = path.with_extension("tar.part");
+            let file = File::create(&temporary).map_err(io(&temporary))?;
+            let builder = tar::Builder::new(BufWriter::with_capacity(1 << 18, file));
+            self.open.insert(folder.to_owned(), (path, builder));
+        }
+        let (path, builder) = self
+            .open
+            .get_mut(folder)
+            .expect("the folder's tar was opened above");
+        // Nothing in the header but name and size: the same clips give the same bytes.
+        let mut header = tar::Header::new_ustar();
+        header.set_size(bytes.len() as u64);
+        header.set_mode(0o644);
+        header.set_mtime(0);
+        builder
+            .append_data(&mut header, format!("{stem}.npz"), bytes)
+            .map_err(io(path))
+    }
+
+    /// Completes the tars and gives them their names.
+    ///
+    /// # Errors
+    /// When the disk refuses.
+    pub fn finish(self) -> Result<(), ShardError> {
+        for (path, builder) in self.open.into_values() {
+            let temporary = path.with_extension("tar.part");
+            let writer = builder.into_inner().map_err(io(&temporary))?;
+            let file = writer
+                .into_inner()
+                .map_err(|e| io(&temporary)(e.into_error()))?;
+            file.sync_all().map_err(io(&temporary))?;
+            std::fs::rename(&temporary, &path).map_err(io(&path))?;
+        }
+        Ok(())
+    }
+}
+
+/// Where a member lies.
+#[derive(Debug, Clone, Copy)]
+struct Place {
+    tar: u32,
+    offset: u64,
+    size: u64,
+}
+
+/// Shards of any number of modalities, indexed by sample.
+#[derive(Debug, Clone)]
+pub struct Shards {
+    tars: Vec<PathBuf>,
+    /// Stems in the order of their first appearance: shard by shard, modality by modality.
+    samples: Vec<String>,
+    modalities: BTreeMap<String, BTreeMap<String, Place>>,
+}
+
+impl Shards {
+    /// Indexes all shards below `root/<modality>/`.
+    ///
+    /// # Errors
+    /// When there are none, or a tar is damaged; the error names file, byte and reason.
+    pub fn open(root: &Path) -> Result<Self, ShardError> {
+        let mut found = Vec::new();
+        for modality in children(root)? {
+            if modality.is_dir() {
+                let name = file_name(&modality);
+                tars_below(&modality, 3, &mut |path| {
+                    found.push((file_name(path), name.clone(), path.to_owned()));
+                })?;
+            }
+        }
+        if found.is_empty() {
+            return Err(ShardError::Empty(root.to_owned()));
+        }
+        // By shard, then data set (in the path), then modality, so that samples keep the order they were written in.
+        found.sort();
+        let mut shards = Self {
+            tars: Vec::new(),
+            samples: Vec::new(),
+            modalities: BTreeMap::new(),
+        };
+        let mut known = std::collections::BTreeSet::new();
+        for (_, modality, path) in found {
+            let tar = shards.tars.len() as u32;
+            let members = index(&path, tar)?;
+            let places = shards.modalities.entry(modality).or_default();
+            for (stem, place) in members {
+                if known.insert(stem.clone()) {
+                    shards.samples.push(stem.clone());
+                }
+                if places.contains_key(&stem) {
+                    return Err(ShardError::Member {
+                        path,
+                        member: stem,
+                        reason: "is there twice".to_owned(),
+                    });
+                }
+                places.insert(stem, place);
+            }
+            shards.tars.push(path);
+        }
+        Ok(shards)
+    }
+
+    /// The stems of all samples, in order.
+    pub fn samples(&self) -> &[String] {
+        &self.samples
+    }
+
+    /// The modalities that have shards, sorted by name.
+    pub fn modalities(&self) -> impl Iterator<Item = &str> {
+        self.modalities.keys().map(String::as_str)
+    }
+
+    /// How many samples have the modality.
+    pub fn count(&self, modality: &str) -> usize {
+        self.modalities.get(modality).map_or(0, BTreeMap::len)
+    }
+
+    /// The bytes of one member; `None` where the sample lacks the modality.
+    ///
+    /// # Errors
+    /// When `sample` is out of range or the file cannot be read.
+    pub fn read(&self, sample: usize, modality: &str) -> Result<Option<Vec<u8>>, ShardError> {
+        let stem = self.samples.get(sample).ok_or(ShardError::NoSample {
+            index: sample,
+            count: self.samples.len(),
+        })?;
+        let Some(place) = self.modalities.get(modality).and_then(|m| m.get(stem)) else {
+            return Ok(None);
+        };
+        let path = &self.tars[place.tar as usize];
+        let mut file = File::open(path).map_err(io(path))?;
+        file.seek(SeekFrom::Start(place.offset)).map_err(io(path))?;
+        let mut bytes = Vec::with_capacity(place.size as usize);
+        file.take(place.size)
+            .read_to_end(&mut bytes)
+            .map_err(io(path))?;
+        if bytes.len() as u64 != place.size {
+            return Err(ShardError::Member {
+                path: path.clone(),
+                member: stem.clone(),
+                reason: "the file has become shorter".to_owned(),
+            });
+        }
+        Ok(Some(bytes))
+    }
+
+    /// An error about one member, for whoever reads its bytes.
+    pub fn member_error(
+        &self,
+        sample: usize,
+        modality: &str,
+        reason: impl std::fmt::Display,
+    ) -> ShardError {
+        let stem = self.samples.get(sample).cloned().unwrap_or_default();
+        let place = self.modalities.get(modality).and_then(|m| m.get(&stem));
+        ShardError::Member {
+            path: place.map_or_else(PathBuf::new, |p| self.tars[p.tar as usize].clone()),
+            member: stem,
+            reason: reason.to_string(),
+        }
+    }
+}
+
+fn file_name(path: &Path) -> String {
+    path.file_name()
+        .unwrap_or_default()
+        .to_string_lossy()
+        .into_owned()
+}
+
+fn children(folder: &Path) -> Result<Vec<PathBuf>, ShardError> {
+    let mut paths = Vec::new();
+    for entry in std::fs::read_dir(folder).map_err(io(folder))? {
+        paths.push(entry.map_err(io(folder))?.path());
+    }
+    paths.sort();
+    Ok(paths)
+}
+
+fn tars_below(folder: &Path, depth: usize, each: &mut impl FnMut(&Path)) -> Result<(), ShardError> {
+    for path in children(folder)? {
+        if path.is_dir() && depth > 0 {
+            tars_below(&path, depth - 1, each)?;
+        } else if path.extension().is_some_and(|e| e == "tar") {
+            each(&path);
+        }
+    }
+    Ok(())
+}
+
+/// Reads the headers of a tar.
+fn index(path: &Path, tar: u32) -> Result<Vec<(String, Place)>, ShardError> {
+    let file = File::open(path).map_err(io(path))?;
+    let length = file.metadata().map_err(io(path))?.len();
+    let mut archive = tar::Archive::new(file);
+    let damaged = |offset: u64, reason: String| ShardError::Tar {
+        path: path.to_owned(),
+        offset,
+        reason,
+    };
+    let mut members = Vec::new();
+    let mut offset = 0;
+    for entry in archive
+        .entries_with_seek()
+        .map_err(|e| damaged(0, e.to_string()))?
+    {
+        let entry = entry.map_err(|e| damaged(offset, e.to_string()))?;
+        offset = entry.raw_file_position();
+        let size = entry.size();
+        if offset.checked_add(size).is_none_or(|end| end > length) {
+            return Err(damaged(
+                offset,
+                format!("a member of {size} bytes in a file of {length}"),
+            ));
+        }
+        if !entry.header().entry_type().is_file() {
+            continue;
+        }
+        let name = entry.path_bytes();
+        let name = std::str::from_utf8(&name)
+            .map_err(|_| damaged(offset, "a name that is not UTF-8".to_owned()))?;
+        let stem = name
+            .strip_suffix(".npz")
+            .or_else(|| name.strip_suffix(".npy"))
+            .ok_or_else(|| damaged(offset, format!("`{name}` is neither .npz nor .npy")))?;
+        let place = Place { tar, offset, size };
+        members.push((stem.to_owned(), place));
+    }
+    Ok(members)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn members_come_back_in_the_order_they_were_written() {
+        let folder = tempfile::tempdir().unwrap();
+        for number in 0..2 {
+            let mut writer = ShardWriter::new(folder.path(), number);
+            for i in 0..3 {
+                let stem = format!("world/{:06}", 5 - (number * 3 + i));
+                writer.add("camera/world", &stem, &[i as u8; 700]).unwrap();
+                if i != 1 {
+                    writer.add("gaze/world", &stem, stem.as_bytes()).unwrap();
+                }
+            }
+            writer.finish().unwrap();
+        }
+        let shards = Shards::open(folder.path()).unwrap();
+        let expected: Vec<String> = (0..6).rev().map(|i| format!("world/{i:06}")).collect();
+        assert_eq!(shards.samples(), expected);
+        assert_eq!(shards.modalities().collect::<Vec<_>>(), ["camera", "gaze"]);
+        assert_eq!((shards.count("camera"), shards.count("gaze")), (6, 4));
+        assert_eq!(shards.read(5, "camera").unwrap().unwrap(), [2; 700]);
+        assert_eq!(shards.read(0, "gaze").unwrap().unwrap(), b"world/000005");
+        assert_eq!(shards.read(1, "gaze").unwrap(), None);
+        assert!(shards.read(6, "gaze").is_err());
+    }
+
+    #[test]
+    fn names_cannot_leave_the_folder() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut writer = ShardWriter::new(folder.path(), 0);
+        for stem in ["../x", "/x", "", "a//b", "a/./b"] {
+            assert!(writer.add("camera/world", stem, b"1").is_err(), "{stem}");
+        }
+    }
+
+    #[test]
+    fn an_unfinished_shard_is_not_seen() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut writer = ShardWriter::new(folder.path(), 0);
+        writer.add("camera/world", "a", b"1").unwrap();
+        drop(writer);
+        assert!(matches!(
+            Shards::open(folder.path()),
+            Err(ShardError::Empty(_))
+        ));
+    }
+
+    #[test]
+    fn damaged_tars_are_errors_and_never_panics() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut writer = ShardWriter::new(folder.path(), 0);
+        for i in 0..4 {
+            writer
+                .add("camera/world", &format!("c{i}"), &[7; 900])
+                .unwrap();
+        }
+        writer.finish().unwrap();
+        let path = folder.path().join("camera/world/shard-000000.tar");
+        let good = std::fs::read(&path).unwrap();
+        let mut errors = 0;
+        for cut in [1, 300, 512, 800, 1300, 2500] {
+            std::fs::write(&path, &good[..cut]).unwrap();
+            errors += usize::from(Shards::open(folder.path()).is_err());
+        }
+        for at in 0..600 {
+            let mut bad = good.clone();
+            bad[at] ^= 0x41;
+            std::fs::write(&path, &bad).unwrap();
+            match Shards::open(folder.path()) {
+                Ok(shards) => (0..shards.samples().len()).for_each(|i| {
+                    let _ = shards.read(i, "camera");
+                }),
+                Err(_) => errors += 1,
+            }
+        }
+        // A size of eight gigabytes in a small file.
+        let mut huge = good.clone();
+        huge[124..136].copy_from_slice(b"77777777777\0");
+        huge[148..156].copy_from_slice(b"        ");
+        let sum: u32 = huge[..512].iter().map(|b| u32::from(*b)).sum();
+        huge[148..156].copy_from_slice(format!("{sum:06o}\0 ").as_bytes());
+        std::fs::write(&path, &huge).unwrap();
+        let message = Shards::open(folder.path()).unwrap_err().to_string();
+        assert!(message.contains("shard-000000.tar"), "{message}");
+        assert!(errors > 200, "{errors}");
+    }
+}
