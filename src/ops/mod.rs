@@ -1,5 +1,6 @@
 //! The ops of the experiment language: one file per op, with its settings, its ports and what it runs.
 
+pub mod clips;
 mod evaluate;
 mod kinds;
 mod table;
