@@ -276,7 +276,7 @@ fn neutral_folder(folder: &Path, depth_rate: f64, depth_start: f64) {
         ndarray::Array3::from_shape_fn((75, 22, 3), |(_, j, k)| [0.0, 1.0, j as f64 * 0.1][k]);
     let depth =
         ndarray::Array3::from_shape_fn(((2.5 * depth_rate) as usize, 64, 96), |(_, y, _)| {
-            if y == 0 { 0.0 } else { 2000.0_f32 }
+            if y < 4 { 0.0 } else { 2000.0_f32 }
         });
     Npz::default()
         .with("T", NpyArray::from(&poses))
