@@ -4,6 +4,8 @@ use crate::decoding::DecodingSettings;
 use crate::evaluation::published::Published;
 use crate::evaluation::suite::Suite;
 use crate::experiment::{Kind, KindEntry};
+use crate::masking::MaskingSettings;
+use crate::mget::Size;
 
 impl Kind for DecodingSettings {
     const KIND: &'static str = "decoding";
@@ -23,3 +25,15 @@ impl Kind for Published {
         "Rows of published tables with their conditions: context, never compared.";
 }
 inventory::submit! { KindEntry::of::<Published>() }
+
+impl Kind for MaskingSettings {
+    const KIND: &'static str = "masking";
+    const ABOUT: &'static str = "Which tokens are given, and which are asked for.";
+}
+inventory::submit! { KindEntry::of::<MaskingSettings>() }
+
+impl Kind for Size {
+    const KIND: &'static str = "size";
+    const ABOUT: &'static str = "Depth and width of MGET.";
+}
+inventory::submit! { KindEntry::of::<Size>() }
