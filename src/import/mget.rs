@@ -196,7 +196,7 @@ pub fn plan(checkpoint: &Checkpoint, heads: Option<usize>) -> Result<Plan, Strin
                 "decoder_depth": decoder_depth,
                 "hidden": hidden,
             },
-            "positions": "release",
+            "positions": "released",
             "modalities": described?,
         }),
     })

@@ -1,11 +1,14 @@
 //! What may happen to an entry of a released checkpoint. Nothing is dropped before it has been shown to be redundant.
 
+use super::pickle::Scalar;
 use super::{Checkpoint, ImportError};
 use crate::nn::positions::{self, GridOrder};
 use serde_json::Value;
 
-/// Position tables must agree with ours to this, element by element.
-const TABLE_TOLERANCE: f32 = 1e-6;
+/// Position tables must agree with ours to this, as `||a - b|| / ||b||`.
+const TABLE_TOLERANCE: f64 = 1e-6;
+/// No element of a position table may be further off: the references compute angles in f32, which costs a few 1e-6.
+const ELEMENT_TOLERANCE: f32 = 1e-5;
 
 /// The fate of one entry.
 #[derive(Debug, Clone, PartialEq)]
@@ -121,11 +124,17 @@ impl Rule {
             }
             Self::Constant { values } => {
                 let found = checkpoint.values(index)?;
+                // What the entry's own type can tell apart.
+                let tolerance = match checkpoint.entries()[index].scalar() {
+                    Scalar::BF16 => 1.0 / 256.0,
+                    Scalar::F16 => 1.0 / 2048.0,
+                    _ => 1e-6,
+                };
                 let same = found.len() == values.len()
                     && found
                         .iter()
                         .zip(values)
-                        .all(|(a, b)| (a - b).abs() <= TABLE_TOLERANCE * b.abs().max(1.0));
+                        .all(|(a, b)| (a - b).abs() <= tolerance * b.abs());
                 if !same {
                     return refuse(format!(
                         "holds {:?}.., this product would use {:?}..",
@@ -143,19 +152,20 @@ impl Rule {
                     Ok(table) => table,
                     Err(reason) => return refuse(reason),
                 };
-                let worst = found
-                    .iter()
-                    .zip(&expected)
-                    .map(|(a, b)| (a - b).abs())
-                    .fold(0.0, f32::max);
-                if worst.is_nan() || worst > TABLE_TOLERANCE || found.len() != expected.len() {
+                let far = found.len() != expected.len()
+                    || found
+                        .iter()
+                        .zip(&expected)
+                        .any(|(a, b)| a.is_nan() || (a - b).abs() > ELEMENT_TOLERANCE);
+                let error = distance(&found, &expected);
+                if far || error.is_nan() || error > TABLE_TOLERANCE {
                     return refuse(format!(
-                        "differs by {worst:.1e} from the position table of a {place:?} grid"
+                        "differs by {error:.1e} from the position table of a {place:?} grid"
                     ));
                 }
                 grid = Some(place.clone());
                 let fate = if *keep { "kept" } else { "left out" };
-                format!("{fate}: the position table of a {place:?} grid, within {worst:.1e}")
+                format!("{fate}: the position table of a {place:?} grid, within {error:.1e}")
             }
         };
         Ok(Verdict { action, grid })
@@ -178,7 +188,8 @@ impl Layout {
         let change = |from: usize, to: usize| {
             (1..rows)
                 .find(|row| {
-                    (from..to).any(|c| (table[row * width + c] - table[c]).abs() > TABLE_TOLERANCE)
+                    (from..to)
+                        .any(|c| (table[row * width + c] - table[c]).abs() > ELEMENT_TOLERANCE)
                 })
                 .unwrap_or(rows)
         };
@@ -204,6 +215,15 @@ impl Layout {
             }
         })
     }
+}
+
+/// `||a - b|| / ||b||`.
+fn distance(a: &[f32], b: &[f32]) -> f64 {
+    let square = |values: &mut dyn Iterator<Item = f32>| -> f64 {
+        values.map(|v| f64::from(v) * f64::from(v)).sum()
+    };
+    let off = square(&mut a.iter().zip(b).map(|(a, b)| a - b));
+    (off / square(&mut b.iter().copied()).max(f64::MIN_POSITIVE)).sqrt()
 }
 
 /// Whether two entries hold the same values, bit for bit. The first is held in memory.

@@ -27,3 +27,6 @@ mod tensorboard;
 mod view;
 mod vq_structure;
 mod world;
+
+mod import;
+mod torch;
