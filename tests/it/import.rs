@@ -238,7 +238,10 @@ fn structured(path: &Path) -> (Vec<Saved>, Vec<String>) {
             .map(|owner| all.iter().position(|s| s.name == owner).unwrap());
         let count = shape.iter().product::<usize>();
         let is_table = name.ends_with("pos_emb") || name.ends_with("position_embeddings");
-        let is_zero = fields[3] == "buffer" && name.ends_with(".bias");
+        let is_zero = fields[3] == "buffer"
+            && name
+                .rsplit_once('.')
+                .is_some_and(|(_, last)| last == "bias");
         let values: Vec<f32> = if is_table {
             table(&name, &shape)
         } else if is_zero {

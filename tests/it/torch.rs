@@ -81,7 +81,9 @@ pub fn pickle(tensors: &[(String, Vec<u8>)], arguments: &[(&str, Argument)]) -> 
             Argument::Number(value) => number(&mut out, (*value).into()),
             Argument::Texts(values) => {
                 out.extend(b"](");
-                values.iter().for_each(|value| text(&mut out, value));
+                for value in values {
+                    text(&mut out, value);
+                }
                 out.push(b'e');
             }
         }
