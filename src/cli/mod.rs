@@ -7,6 +7,7 @@ mod check;
 mod compare;
 mod completions;
 mod gc;
+mod import;
 mod list;
 mod plan;
 mod request;
@@ -59,6 +60,7 @@ commands! {
     compare::Compare,
     verify::Verify,
     gc::Gc,
+    import::Import,
     schema::Schema,
     completions::Completions,
 }

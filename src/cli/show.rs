@@ -10,11 +10,11 @@ use serde_json::json;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
-/// Show an op, a registry entry or a run
+/// Show an op, a registry entry, a run or the entries of a checkpoint file
 #[derive(Debug, clap::Args)]
 pub struct Show {
-    /// An op, an entry (`uniform`, or `masking/uniform`), or a run
-    #[arg(value_name = "RUN|ENTRY|OP")]
+    /// An op, an entry (`uniform`, or `masking/uniform`), a run, or a checkpoint file
+    #[arg(value_name = "RUN|ENTRY|OP|FILE")]
     name: String,
     /// Where runs are
     #[arg(long, default_value = "runs", value_name = "DIR")]
@@ -26,6 +26,10 @@ pub struct Show {
 
 impl super::Run for Show {
     fn run(self, terminal: &Terminal) -> Result<(), Failure> {
+        let path = Path::new(&self.name);
+        if path.is_file() {
+            return super::import::show(path, self.json, terminal);
+        }
         let catalog = Catalog::linked();
         let registry = Registry::new(&catalog, beside(Path::new("./x"), "registry").as_deref());
         let mut found = false;

@@ -4,6 +4,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::experiment::{Kind, KindEntry};
+use crate::tokenizer::video::VideoSettings;
 use crate::tokenizer::vq::VqSettings;
 
 /// A tokenizer before it is trained, by family.
@@ -12,6 +13,8 @@ use crate::tokenizer::vq::VqSettings;
 pub enum TokenizerEntry {
     /// VQ-VAE of signals or joints over time.
     Vq(VqSettings),
+    /// Wavelet, causal convolutions and scalar quantisation of video.
+    Video(VideoSettings),
 }
 
 impl Default for TokenizerEntry {
@@ -43,8 +46,10 @@ mod tests {
         let map = value.as_object_mut().unwrap();
         assert_eq!(map.remove("tokenizer").unwrap(), name);
         assert!(map.remove("about").unwrap().is_string());
-        let TokenizerEntry::Vq(settings) = serde_json::from_value(value).unwrap();
-        settings
+        match serde_json::from_value(value).unwrap() {
+            TokenizerEntry::Vq(settings) => settings,
+            TokenizerEntry::Video(_) => panic!("{name} is a video tokenizer"),
+        }
     }
 
     #[test]

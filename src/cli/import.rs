@@ -1,0 +1,125 @@
+//! `reviv import`: released weights of others into our safetensors; and what `reviv show FILE` says of a checkpoint.
+
+use super::terminal::{Failure, Terminal};
+use crate::import::cosmos::parse_compression;
+use crate::import::{Checkpoint, ImportError, ImportOptions, import};
+use serde_json::json;
+use std::fmt::Write as _;
+use std::path::{Path, PathBuf};
+
+/// Import released weights (`.pth`, `.jit`, safetensors) and their statistics
+///
+/// Nothing in a file is executed, and nothing is dropped before it has been checked to be redundant. The weights stay under
+/// their authors' licence.
+#[derive(Debug, clap::Args)]
+pub struct Import {
+    /// Checkpoints and `norm_stats` files of one set, or their folder
+    #[arg(required = true, value_name = "FILE")]
+    files: Vec<PathBuf>,
+    /// The folder to make
+    #[arg(short, long, value_name = "DIR")]
+    output: PathBuf,
+    /// Attention heads, where a checkpoint does not name its builder
+    #[arg(long, value_name = "N")]
+    heads: Option<usize>,
+    /// Frames and pixels per token of a video tokenizer that is not named after them: 4x8x8 or 8x16x16
+    #[arg(long, value_name = "TxHxW")]
+    video: Option<String>,
+    /// Write JSON to stdout
+    #[arg(long)]
+    json: bool,
+}
+
+impl super::Run for Import {
+    fn run(self, terminal: &Terminal) -> Result<(), Failure> {
+        let compression = match &self.video {
+            Some(text) => Some(parse_compression(text).ok_or_else(|| {
+                Failure::input(
+                    format!("`--video {text}` is not a compression"),
+                    "write it as `4x8x8`: frames, height and width per token",
+                )
+            })?),
+            None => None,
+        };
+        let options = ImportOptions {
+            heads: self.heads,
+            compression,
+        };
+        let report = import(&self.files, &self.output, &options).map_err(failure)?;
+        for notice in &report.notices {
+            terminal.note(format_args!("note: {notice}\n"));
+        }
+        if self.json {
+            let parts: Vec<_> = report
+                .parts
+                .iter()
+                .map(|part| {
+                    json!({
+                        "name": part.name, "entries": part.entries, "written": part.written,
+                        "values": part.values,
+                    })
+                })
+                .collect();
+            terminal.json(&json!({ "folder": report.folder, "parts": parts }));
+            return Ok(());
+        }
+        for part in &report.parts {
+            terminal.data(format_args!(
+                "{}: {} of {} entries written, {} values; the others were checked and are redundant\n",
+                part.name, part.written, part.entries, part.values
+            ));
+        }
+        terminal.data(format_args!("{}\n", report.folder.display()));
+        Ok(())
+    }
+}
+
+/// Lists the entries of a checkpoint, without loading them.
+pub(super) fn show(path: &Path, as_json: bool, terminal: &Terminal) -> Result<(), Failure> {
+    let checkpoint = Checkpoint::open(path).map_err(failure)?;
+    let entries = checkpoint.entries();
+    let same = |index: Option<usize>| index.map(|i| entries[i].name.as_str());
+    if as_json {
+        let entries: Vec<_> = entries
+            .iter()
+            .map(|entry| {
+                json!({
+                    "name": entry.name, "type": entry.scalar().name(), "shape": entry.shape(),
+                    "bytes": entry.bytes(), "same_as": same(entry.same_as),
+                })
+            })
+            .collect();
+        terminal.json(&json!({
+            "file": path, "format": format!("{:?}", checkpoint.format()), "entries": entries,
+            "arguments": checkpoint.arguments(), "others": checkpoint.others(),
+        }));
+        return Ok(());
+    }
+    let mut text = String::new();
+    let width = entries.iter().map(|e| e.name.len()).max().unwrap_or(0);
+    for entry in entries {
+        let shape = format!("{:?}", entry.shape());
+        let _ = write!(
+            text,
+            "{:<width$}  {:<4}  {shape}",
+            entry.name,
+            entry.scalar().name()
+        );
+        if let Some(owner) = same(entry.same_as) {
+            let _ = write!(text, "  = {owner}");
+        }
+        text.push('\n');
+    }
+    let distinct = entries.iter().filter(|e| e.same_as.is_none());
+    let bytes: u64 = distinct.map(crate::import::Entry::bytes).sum();
+    let _ = writeln!(text, "{} entries, {bytes} bytes", entries.len());
+    terminal.data(text);
+    Ok(())
+}
+
+fn failure(error: ImportError) -> Failure {
+    match error {
+        ImportError::Io { .. } => Failure::machine(error),
+        other => Failure::input(other.to_string(), ""),
+    }
+}
