@@ -11,6 +11,7 @@ use crate::run::RunDirectory;
 use crate::run::execute::cache_of;
 use crate::run::files::read_json;
 use crate::run::schedule::Schedule;
+use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
 /// Put the scores of runs side by side, with intervals and paired differences
@@ -117,15 +118,16 @@ impl Compare {
             "{} simultaneous poses (within {} s)\n\n",
             rigid.n_poses, self.max_difference
         );
-        text += &format!(
-            "{:<34}{:>22}{:>22}\n",
+        let _ = writeln!(
+            text,
+            "{:<34}{:>22}{:>22}",
             "", "rigid (SE3)", "similarity (Sim3)"
         );
         for (name, of) in ROWS {
             let show = |errors: &TrajectoryErrors| {
                 of(errors).map_or_else(|| "-".to_owned(), |v| format!("{v:.15}"))
             };
-            text += &format!("{name:<34}{:>22}{:>22}\n", show(&rigid), show(&similar));
+            let _ = writeln!(text, "{name:<34}{:>22}{:>22}", show(&rigid), show(&similar));
         }
         if similar.degenerate {
             text += "\ndegenerate: the alignment is not unique; do not compare these numbers\n";
