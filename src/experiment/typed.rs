@@ -90,7 +90,9 @@ impl<'c> Typer<'c, '_> {
             return self.entry(kind, settings, node, path);
         }
         if schema.get("x-path").is_some() {
-            return self.path(node, path);
+            // An optional path has the type `["string", "null"]`.
+            let optional = schema.get("type").is_some_and(Value::is_array);
+            return self.path(node, path, optional);
         }
         if let Some(all) = schema.get("allOf").and_then(Value::as_array)
             && let [only] = all.as_slice()
@@ -607,7 +609,10 @@ impl<'c> Typer<'c, '_> {
         self.plain(schema, node, path)
     }
 
-    fn path(&mut self, node: &Node, path: &str) -> Option<Value> {
+    fn path(&mut self, node: &Node, path: &str, optional: bool) -> Option<Value> {
+        if node.data == Data::Null && optional {
+            return Some(Value::Null);
+        }
         let Some(text) = node.text() else {
             self.report(wrong_type(&["string"], node, path));
             return None;
