@@ -8,8 +8,8 @@ mod run;
 
 use crate::engine::{DeviceChoice, Precision};
 use crate::experiment::{
-    Arity, ArtifactKind, Code, Description, Entry, Inputs, Kind, KindEntry, Op, OpEntry, Port,
-    Problem, StageContext, StageError, StagePlan, TokenFacts, TokenPlan,
+    Arity, ArtifactKind, Code, Description, Entry, Inputs, Op, OpEntry, Port, Problem,
+    StageContext, StageError, StagePlan, TokenFacts, TokenPlan,
 };
 use crate::masking::{MaskingError, MaskingSettings, PIXELS, simulate};
 use crate::mget::{MgetSpec, ModalitySpec, Positions, Size, SpecError};
@@ -21,18 +21,6 @@ use std::collections::BTreeMap;
 
 /// Draws of the plan's simulation of masking.
 const SIMULATED: usize = 500;
-
-impl Kind for MaskingSettings {
-    const KIND: &'static str = "masking";
-    const ABOUT: &'static str = "Which tokens are given, and which are asked for.";
-}
-inventory::submit! { KindEntry::of::<MaskingSettings>() }
-
-impl Kind for Size {
-    const KIND: &'static str = "size";
-    const ABOUT: &'static str = "Depth and width of MGET.";
-}
-inventory::submit! { KindEntry::of::<Size>() }
 
 /// Whether raw video is an input beside the tokens.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
