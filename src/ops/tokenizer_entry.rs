@@ -13,7 +13,7 @@ use crate::tokenizer::vq::VqSettings;
 pub enum TokenizerEntry {
     /// VQ-VAE of signals or joints over time.
     Vq(VqSettings),
-    /// Wavelet, causal convolutions and scalar quantisation of video.
+    /// Wavelet, causal convolutions and finite scalar quantisation of video (Cosmos).
     Video(VideoSettings),
 }
 
@@ -36,7 +36,7 @@ mod tests {
     use crate::modality::Shape;
     use serde_json::Value;
 
-    fn entry(name: &str) -> VqSettings {
+    fn entry(name: &str) -> TokenizerEntry {
         let path = format!(
             "{}/registry/tokenizer/{name}.yaml",
             env!("CARGO_MANIFEST_DIR")
@@ -46,10 +46,7 @@ mod tests {
         let map = value.as_object_mut().unwrap();
         assert_eq!(map.remove("tokenizer").unwrap(), name);
         assert!(map.remove("about").unwrap().is_string());
-        match serde_json::from_value(value).unwrap() {
-            TokenizerEntry::Vq(settings) => settings,
-            TokenizerEntry::Video(_) => panic!("{name} is a video tokenizer"),
-        }
+        serde_json::from_value(value).unwrap()
     }
 
     #[test]
@@ -70,9 +67,27 @@ mod tests {
             ("vq_temporal_small", temporal(6), 128, vec![30]),
             ("vq_kinematic_small", joints, 256, vec![30, 7]),
         ] {
-            let settings = entry(name);
+            let TokenizerEntry::Vq(settings) = entry(name) else {
+                panic!("{name}");
+            };
             assert_eq!(settings.codebook, codebook, "{name}");
             assert_eq!(settings.patches(&shape).unwrap().grid(), grid, "{name}");
+        }
+    }
+
+    #[test]
+    fn every_shipped_video_entry_has_sizes_that_fit() {
+        for (name, vocabulary) in [
+            ("cosmos_dv4x8x8", 64_000),
+            ("cosmos_dv8x16x16", 64_000),
+            ("video_small", 1000),
+            ("video_tiny", 200),
+        ] {
+            let TokenizerEntry::Video(settings) = entry(name) else {
+                panic!("{name}");
+            };
+            settings.check().unwrap();
+            assert_eq!(settings.vocabulary(), vocabulary, "{name}");
         }
     }
 

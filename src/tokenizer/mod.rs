@@ -1,11 +1,14 @@
 //! Tokenizers: every modality becomes a grid of discrete tokens and back (Sec. 4.2, Supp. A).
 
 pub mod normaliser;
+pub mod open;
 pub mod patches;
 pub mod quantizer;
 pub mod trained;
 pub mod video;
 pub mod vq;
+
+pub use open::{open, open_on};
 
 use crate::clip::Signal;
 

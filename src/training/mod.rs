@@ -2,11 +2,12 @@
 //!
 //! Read in this order: [`settings`], [`source`] (where tokens come from), [`order`] (which clip stands where), [`loader`]
 //! (batches prepared ahead), [`trainer`] (**one step, and the state between steps**), [`validation`], [`optimizer`],
-//! [`schedule`]; [`tokenizer`] trains VQ-VAEs.
+//! [`schedule`]; [`tokenizer`] trains VQ-VAEs, [`video_tokenizer`] video tokenizers, [`kmeans`] is what both have to beat.
 //!
 //! Data order, masks and initial weights are functions of the seed and the step, so a run that was killed and resumed has the
 //! same bytes as one that was not.
 
+pub mod kmeans;
 pub mod loader;
 pub mod optimizer;
 pub mod order;
@@ -17,6 +18,7 @@ pub mod source;
 pub mod tokenizer;
 pub mod trainer;
 pub mod validation;
+pub mod video_tokenizer;
 
 pub use loader::{Feed, Loader};
 pub use optimizer::{AdamW, AdamWSettings};

@@ -14,6 +14,7 @@ use super::schedule::{Schedule, ScheduleError, Shape};
 use crate::clip::Signal;
 use crate::engine::{EngineError, Gradients, Parameters, Weights};
 use crate::random::stream;
+use crate::tokenizer::TokenizerError;
 use crate::tokenizer::trained::{Prepared, batch};
 use crate::tokenizer::vq::VqVae;
 
@@ -71,6 +72,8 @@ pub enum TrainingError {
     #[error("there is nothing to train on")]
     NoData,
     #[error(transparent)]
+    Tokenizer(#[from] TokenizerError),
+    #[error(transparent)]
     Schedule(#[from] ScheduleError),
     #[error(transparent)]
     Engine(#[from] EngineError),
@@ -82,10 +85,43 @@ pub struct Trainer {
     model: VqVae,
     optimizer: AdamW,
     schedule: Schedule,
-    batch: usize,
+    epochs: Epochs,
     seed: u64,
+}
+
+/// Which signals each step sees: epochs are permutations, drawn for (seed, epoch), read one after the other.
+#[derive(Debug, Clone)]
+pub(super) struct Epochs {
+    seed: u64,
+    batch: usize,
     /// The order of the epoch it was last asked for.
     order: (u64, Vec<usize>),
+}
+
+impl Epochs {
+    pub(super) fn new(seed: u64, batch: usize) -> Self {
+        Self {
+            seed,
+            batch: batch.max(1),
+            order: (u64::MAX, Vec::new()),
+        }
+    }
+
+    /// The signals of `step`, of `count` (at least 1) that there are.
+    pub(super) fn choose(&mut self, step: u64, count: usize) -> Vec<usize> {
+        let first = step * self.batch as u64;
+        (first..first + self.batch as u64)
+            .map(|place| {
+                let epoch = place / count as u64;
+                if self.order.0 != epoch || self.order.1.len() != count {
+                    let mut order: Vec<usize> = (0..count).collect();
+                    order.shuffle(&mut stream(self.seed, "train_tokenizer.order", epoch, 0));
+                    self.order = (epoch, order);
+                }
+                self.order.1[(place % count as u64) as usize]
+            })
+            .collect()
+    }
 }
 
 impl Trainer {
@@ -108,9 +144,8 @@ impl Trainer {
                 settings.warmup,
                 settings.steps,
             )?,
-            batch: settings.batch,
+            epochs: Epochs::new(seed, settings.batch),
             seed,
-            order: (u64::MAX, Vec::new()),
             model,
         })
     }
@@ -131,22 +166,6 @@ impl Trainer {
         self.steps() >= self.schedule.total()
     }
 
-    /// The signals of `step`: epochs are permutations, drawn for (seed, epoch), read one after the other.
-    fn choose(&mut self, step: u64, count: usize) -> Vec<usize> {
-        let first = step * self.batch as u64;
-        (first..first + self.batch as u64)
-            .map(|place| {
-                let epoch = place / count as u64;
-                if self.order.0 != epoch || self.order.1.len() != count {
-                    let mut order: Vec<usize> = (0..count).collect();
-                    order.shuffle(&mut stream(self.seed, "train_tokenizer.order", epoch, 0));
-                    self.order = (epoch, order);
-                }
-                self.order.1[(place % count as u64) as usize]
-            })
-            .collect()
-    }
-
     /// Takes one step on `data`, normalised signals.
     ///
     /// # Errors
@@ -157,6 +176,7 @@ impl Trainer {
         }
         let step = self.steps();
         let chosen: Vec<Prepared> = self
+            .epochs
             .choose(step, data.len())
             .into_iter()
             .map(|i| data[i].clone())
@@ -359,7 +379,7 @@ mod tests {
     #[test]
     fn every_signal_is_seen_once_per_epoch() {
         let mut trainer = trainer(50);
-        let seen: Vec<usize> = (0..5).flat_map(|step| trainer.choose(step, 20)).collect();
+        let seen: Vec<usize> = (0..5).flat_map(|step| trainer.epochs.choose(step, 20)).collect();
         for epoch in seen.chunks(20) {
             let mut epoch = epoch.to_vec();
             epoch.sort_unstable();

@@ -4,7 +4,8 @@
 //! Read in this order: [`settings`] (sizes, and from them every layer), [`haar`] (pixels to wavelet coefficients and back),
 //! [`layers`] (convolution, norm, residual block, attention, resampling), [`network`] (encoder and decoder, parameters named as
 //! in NVIDIA's files), [`fsq`] (latents to tokens), [`padding`] (clips to the lengths and sizes the network takes) and
-//! [`tokenizer`] (signals to tokens and back, and one training step).
+//! [`tokenizer`] (signals to tokens and back, and one training step),
+//! [`stored`] (the file).
 
 pub mod fsq;
 pub mod haar;
@@ -12,6 +13,7 @@ pub mod layers;
 pub mod network;
 pub mod padding;
 pub mod settings;
+pub mod stored;
 pub mod tokenizer;
 
 pub use fsq::Fsq;

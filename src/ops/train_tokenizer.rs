@@ -1,0 +1,382 @@
+//! `op: train_tokenizer`: trains the tokenizer of one modality (Sec. 4.2, Supp. A).
+//!
+//! Signals over time and joints over time get a VQ-VAE, video gets the wavelet tokenizer. Statistics for normalisation come
+//! from the training split, scores from the validation split. A hand's tokenizer also trains on the other hand in a mirror.
+//! Writes `tokenizer.safetensors`, `scores.json` and `report/tokenizer.md`.
+
+mod errors;
+mod report;
+mod run;
+mod scores;
+
+use super::clip_signals::{described_format, modality, unknown_modality};
+use super::tokenizer_entry::TokenizerEntry;
+use crate::engine::{Compute, DeviceChoice, Initialise, Parameters, Precision};
+use crate::experiment::{
+    Arity, ArtifactKind, Code, Description, Entry, Inputs, Op, OpEntry, Port, Problem,
+    StageContext, StageError, StagePlan, TokenFacts, TokenPlan,
+};
+use crate::modality::Shape;
+use crate::tokenizer::video::padding::Padding;
+use crate::tokenizer::video::Network;
+use crate::tokenizer::vq::VqVae;
+use crate::training::AdamWSettings;
+use crate::training::tokenizer::TokenizerTraining;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+
+/// Settings of [`TrainTokenizer`].
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct TrainTokenizerSettings {
+    /// The modality: `rgb depth camera gaze left_hand right_hand body`, or a declared one.
+    pub modality: String,
+    /// Family and sizes.
+    pub tokenizer: Entry<TokenizerEntry>,
+    /// Optimizer steps.
+    #[schemars(range(min = 1))]
+    pub steps: u64,
+    /// Signals per step.
+    #[schemars(range(min = 1))]
+    pub batch: usize,
+    /// Peak learning rate; it falls along half a cosine.
+    pub rate: f64,
+    /// Steps until the peak.
+    pub warmup: u64,
+    /// The optimizer.
+    pub optimizer: AdamWSettings,
+    /// Hands only: train on the other hand in a mirror, too.
+    pub mirror: bool,
+    /// Checkpoint after every so many steps; 0: only when interrupted.
+    pub checkpoint_every: u64,
+    /// At most so many held-out clips are scored.
+    #[schemars(range(min = 1))]
+    pub validation_clips: usize,
+    /// Also fit k-means with as many codes, the baseline of a codebook without a network.
+    pub kmeans: bool,
+    /// Where to train.
+    pub device: DeviceChoice,
+}
+
+impl Default for TrainTokenizerSettings {
+    fn default() -> Self {
+        let training = TokenizerTraining::default();
+        Self {
+            modality: String::new(),
+            tokenizer: Entry {
+                name: "vq_temporal_small".to_owned(),
+                settings: TokenizerEntry::default(),
+            },
+            steps: training.steps,
+            batch: training.batch,
+            rate: training.rate,
+            warmup: training.warmup,
+            optimizer: training.optimizer,
+            mirror: true,
+            checkpoint_every: 500,
+            validation_clips: 1000,
+            kmeans: true,
+            device: DeviceChoice::Cpu,
+        }
+    }
+}
+
+impl TrainTokenizerSettings {
+    fn training(&self) -> TokenizerTraining {
+        TokenizerTraining {
+            steps: self.steps,
+            batch: self.batch,
+            rate: self.rate,
+            warmup: self.warmup,
+            optimizer: self.optimizer.clone(),
+        }
+    }
+
+    /// The hand whose mirror image trains too.
+    fn other_hand(&self) -> Option<&'static str> {
+        match self.modality.as_str() {
+            "left_hand" if self.mirror => Some("right_hand"),
+            "right_hand" if self.mirror => Some("left_hand"),
+            _ => None,
+        }
+    }
+}
+
+/// The op.
+#[derive(Debug)]
+pub struct TrainTokenizer;
+inventory::submit! { OpEntry(&TrainTokenizer) }
+
+impl Op for TrainTokenizer {
+    type Settings = TrainTokenizerSettings;
+
+    fn name(&self) -> &'static str {
+        "train_tokenizer"
+    }
+
+    fn version(&self) -> u32 {
+        1
+    }
+
+    fn about(&self) -> &'static str {
+        "Trains the tokenizer of one modality, and scores it on held-out clips."
+    }
+
+    fn inputs(&self) -> &'static [Port] {
+        &[Port {
+            name: "clips",
+            kinds: &[ArtifactKind::Clips],
+            arity: Arity::One,
+            about: "clips to train on (`train`) and to score on (`validation`)",
+        }]
+    }
+
+    fn output(&self) -> ArtifactKind {
+        ArtifactKind::Tokenizer
+    }
+
+    fn check(
+        &self,
+        settings: &TrainTokenizerSettings,
+        inputs: &Inputs<'_>,
+        problems: &mut Vec<Problem>,
+    ) -> Description {
+        let Some(clips) = inputs.one("clips") else {
+            return Description::default();
+        };
+        if settings.modality.is_empty() {
+            problems.push(
+                Problem::new(Code::E0204, "modality", "the modality is not named").help(format!(
+                    "the clips have: {}",
+                    names(clips.signals.keys())
+                )),
+            );
+            return Description::default();
+        }
+        let format = described_format(clips).unwrap_or_default();
+        let (Some(facts), Some(modality)) = (
+            clips.signals.get(&settings.modality),
+            modality(&format, &settings.modality),
+        ) else {
+            problems.push(unknown_modality(
+                "modality".to_owned(),
+                &settings.modality,
+                clips,
+            ));
+            return Description::default();
+        };
+        if settings.warmup > settings.steps {
+            let message = format!("{} warm-up steps in a run of {}", settings.warmup, settings.steps);
+            problems.push(Problem::new(Code::E0206, "warmup", message));
+        }
+        if !(settings.rate.is_finite() && settings.rate > 0.0) {
+            let message = format!("a learning rate of {}", settings.rate);
+            problems.push(Problem::new(Code::E0202, "rate", message));
+        }
+        if clips.clips.get("train").is_none_or(|count| *count == 0) {
+            let problem = Problem::new(Code::E0401, "clips", "the clips have no `train` split");
+            problems.push(problem.help("give the clips stage `train:` a number"));
+        }
+        if clips.clips.get("validation").is_none_or(|count| *count == 0) {
+            let problem = Problem::new(Code::W0701, "clips", "no held-out clips to score on");
+            problems.push(problem.help("give the clips stage `validation:` a number"));
+        }
+        match tokens(&settings.tokenizer.settings, &modality.shape()) {
+            Ok(tokens) => Description {
+                tokens: [(settings.modality.clone(), tokens)].into(),
+                signals: [(settings.modality.clone(), facts.clone())].into(),
+                extra: [("tokenizer".to_owned(), json!(settings.tokenizer.name))].into(),
+                ..Description::default()
+            },
+            Err(message) => {
+                let help = match modality.shape() {
+                    Shape::Temporal { .. } => "signals over time take `vq_temporal_small` and its like",
+                    Shape::Kinematic { .. } => "joints take `vq_kinematic_small` and its like",
+                    Shape::Video { .. } => "video takes `video_small` and its like",
+                };
+                problems.push(Problem::new(Code::E0401, "tokenizer", message).help(help));
+                Description::default()
+            }
+        }
+    }
+
+    fn plan(
+        &self,
+        settings: &TrainTokenizerSettings,
+        inputs: &Inputs<'_>,
+        _seed: u64,
+    ) -> StagePlan {
+        let format = inputs.one("clips").and_then(described_format).unwrap_or_default();
+        let Some(modality) = modality(&format, &settings.modality) else {
+            return StagePlan::default();
+        };
+        let (entry, shape) = (&settings.tokenizer.settings, modality.shape());
+        let Ok(tokens) = tokens(entry, &shape) else {
+            return StagePlan::default();
+        };
+        let parameters = parameters(entry, &shape);
+        let signals = (settings.steps * settings.batch as u64) as f64;
+        let flop = match entry {
+            // A multiply-accumulate per parameter and token is two operations, and backward costs twice the forward.
+            TokenizerEntry::Vq(_) => {
+                parameters.map(|count| 6.0 * count as f64 * tokens.count() as f64 * signals)
+            }
+            TokenizerEntry::Video(_) => None,
+        };
+        StagePlan {
+            shapes: vec![
+                ("signal".to_owned(), super::clips::shape_of(modality.as_ref())),
+                ("tokens".to_owned(), tokens.grid.clone()),
+            ],
+            parameters,
+            tokens: vec![TokenPlan {
+                modality: settings.modality.clone(),
+                tokens: tokens.count(),
+                vocabulary: tokens.vocabulary,
+                mean_input: None,
+                mean_target: None,
+            }],
+            work: Some((settings.steps, "steps".to_owned())),
+            // Weights, gradients and two moments in f32.
+            memory: parameters.map(|count| 16 * count),
+            disk: parameters.map(|count| 4 * count),
+            flop,
+            ..StagePlan::default()
+        }
+    }
+
+    fn run(
+        &self,
+        settings: &TrainTokenizerSettings,
+        context: &mut dyn StageContext,
+    ) -> Result<Value, StageError> {
+        run::run(settings, context)
+    }
+}
+
+fn names<'a>(names: impl Iterator<Item = &'a String>) -> String {
+    names.map(String::as_str).collect::<Vec<_>>().join(", ")
+}
+
+/// The tokens of signals of `shape`, or why the entry does not take them.
+fn tokens(entry: &TokenizerEntry, shape: &Shape) -> Result<TokenFacts, String> {
+    match (entry, shape) {
+        (TokenizerEntry::Vq(settings), _) => {
+            let patches = settings.patches(shape).map_err(|error| error.to_string())?;
+            Ok(TokenFacts {
+                grid: patches.grid(),
+                vocabulary: settings.codebook as u64,
+            })
+        }
+        (
+            TokenizerEntry::Video(settings),
+            Shape::Video {
+                frames,
+                height,
+                width,
+            },
+        ) => {
+            settings.check().map_err(|error| error.to_string())?;
+            let clip = [*frames, *height, *width];
+            if clip.contains(&0) {
+                return Err(format!("clips of {clip:?} frames, height, width"));
+            }
+            let padding = Padding::of(clip, settings.temporal, settings.spatial);
+            Ok(TokenFacts {
+                grid: settings.grid(padding.padded).to_vec(),
+                vocabulary: settings.vocabulary() as u64,
+            })
+        }
+        (TokenizerEntry::Video(_), _) => {
+            Err("a video tokenizer takes video; other signals have a VQ-VAE".to_owned())
+        }
+    }
+}
+
+/// How many trainable numbers the tokenizer has; nothing is allocated.
+fn parameters(entry: &TokenizerEntry, shape: &Shape) -> Option<u64> {
+    let compute = Compute::cpu();
+    let planned = Initialise::planned(&compute);
+    let count = match entry {
+        TokenizerEntry::Vq(settings) => VqVae::new(&planned, settings, shape).ok()?.count(),
+        TokenizerEntry::Video(settings) => Network::new(&planned, settings).ok()?.count(),
+    };
+    Some(count as u64)
+}
+
+/// The device to train on.
+fn compute(settings: &TrainTokenizerSettings) -> Result<Compute, StageError> {
+    Compute::new(settings.device, 0, Precision::F32).map_err(StageError::other)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::experiment::{InputFacts, SignalFacts};
+    use crate::modality::ClipFormat;
+
+    fn clips() -> Description {
+        let format = ClipFormat {
+            size: 64,
+            ..ClipFormat::default()
+        };
+        let facts = |shape: &[usize]| SignalFacts {
+            shape: shape.to_vec(),
+            rate: 30.0,
+        };
+        Description {
+            clips: [("train".to_owned(), 10), ("validation".to_owned(), 4)].into(),
+            signals: [
+                ("rgb".to_owned(), facts(&[16, 64, 64, 3])),
+                ("body".to_owned(), facts(&[60, 21, 3])),
+            ]
+            .into(),
+            extra: [("format".to_owned(), json!(format))].into(),
+            ..Description::default()
+        }
+    }
+
+    fn check(settings: Value) -> (Description, Vec<Problem>) {
+        let clips = clips();
+        let inputs = Inputs::new(vec![(
+            "clips",
+            vec![InputFacts {
+                stage: "clips",
+                kind: ArtifactKind::Clips,
+                description: &clips,
+            }],
+        )]);
+        let settings: TrainTokenizerSettings = serde_json::from_value(settings).unwrap();
+        let mut problems = Vec::new();
+        let description = TrainTokenizer.check(&settings, &inputs, &mut problems);
+        if problems.is_empty() {
+            let plan = TrainTokenizer.plan(&settings, &inputs, 0);
+            assert!(plan.parameters.unwrap() > 0);
+        }
+        (description, problems)
+    }
+
+    #[test]
+    fn the_form_of_tokens_is_known_before_anything_runs() {
+        let body = json!({"use": "b", "family": "vq", "codebook": 32, "compression": [2, 3], "width": 16, "depth": 1, "heads": 2});
+        let (description, problems) = check(json!({"modality": "body", "tokenizer": body}));
+        assert!(problems.is_empty(), "{problems:?}");
+        assert_eq!(description.tokens["body"].grid, [30, 7]);
+        assert_eq!(description.tokens["body"].vocabulary, 32);
+        let video = json!({"use": "v", "family": "video", "channels": 4, "multipliers": [1, 2], "blocks": 1, "levels": [4, 4]});
+        let (description, problems) = check(json!({"modality": "rgb", "tokenizer": video}));
+        assert!(problems.is_empty(), "{problems:?}");
+        assert_eq!(description.tokens["rgb"].grid, [5, 8, 8]);
+    }
+
+    #[test]
+    fn a_modality_or_a_family_that_does_not_fit_is_refused_where_it_is_written() {
+        let key = |settings| check(settings).1[0].key.clone();
+        let vq = json!({"use": "vq", "family": "vq", "compression": [2]});
+        assert_eq!(key(json!({"tokenizer": vq})), "modality");
+        assert_eq!(key(json!({"modality": "bodi", "tokenizer": vq})), "modality");
+        assert_eq!(key(json!({"modality": "body", "tokenizer": vq})), "tokenizer");
+        assert_eq!(key(json!({"modality": "rgb", "tokenizer": vq})), "tokenizer");
+    }
+}

@@ -1,0 +1,67 @@
+//! The section of a tokenizer on the page of its run.
+
+use super::TrainTokenizerSettings;
+use super::scores::Scores;
+use crate::experiment::TokenFacts;
+use std::fmt::Write;
+
+/// Words for the metrics; others are shown by name.
+const METRICS: [(&str, &str); 6] = [
+    ("mpjpe_mm", "joint position error, mm"),
+    ("position_mm", "position error, mm"),
+    ("rotation_deg", "rotation error, degrees"),
+    ("distance_percent", "distance, % of the image width"),
+    ("angle_deg", "angle, degrees"),
+    ("psnr_db", "PSNR, dB (higher is better)"),
+];
+
+pub(super) fn markdown(
+    settings: &TrainTokenizerSettings,
+    tokens: &TokenFacts,
+    parameters: usize,
+    scores: &Scores,
+) -> String {
+    let mut page = format!(
+        "## Tokenizer of `{}`\n\n`{}`: {:?} tokens of {}, {parameters} parameters, {} steps of {} signals.\n\n",
+        settings.modality,
+        settings.tokenizer.name,
+        tokens.grid,
+        tokens.vocabulary,
+        settings.steps,
+        settings.batch,
+    );
+    if scores.clips == 0 {
+        page.push_str("No held-out clip has this modality: nothing was scored.\n");
+        return page;
+    }
+    let _ = write!(
+        page,
+        "Reconstruction of {} held-out clips:\n\n| error | tokenizer | predicting the mean | k-means, {} codes |\n|---|---|---|---|\n",
+        scores.clips, tokens.vocabulary,
+    );
+    for (name, value) in &scores.reconstruction {
+        let words = METRICS.iter().find(|(metric, _)| metric == name);
+        let words = words.map_or_else(|| name.replace("rmse_", "RMSE of channel "), |(_, words)| (*words).to_owned());
+        let other = |errors: &std::collections::BTreeMap<String, f64>| {
+            errors
+                .get(name)
+                .map_or_else(|| "not computed".to_owned(), |value| format!("{value:.3}"))
+        };
+        let _ = writeln!(
+            page,
+            "| {words} | {value:.3} | {} | {} |",
+            other(&scores.mean),
+            other(&scores.kmeans),
+        );
+    }
+    if let (Some(usage), Some(perplexity)) = (scores.usage, scores.perplexity) {
+        let _ = write!(
+            page,
+            "\n{:.1}% of the codes occur in the {} tokens of these clips; perplexity {perplexity:.1} of {}.\n",
+            100.0 * usage,
+            scores.tokens,
+            tokens.vocabulary,
+        );
+    }
+    page
+}

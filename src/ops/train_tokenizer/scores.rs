@@ -1,0 +1,119 @@
+//! How well a tokenizer reconstructs clips it never saw, beside what is possible without one.
+
+use super::super::clip_signals::{Extracted, extract};
+use super::errors::Errors;
+use crate::clip::Signal;
+use crate::clip::store::ClipSet;
+use crate::experiment::{StageContext, StageError};
+use crate::modality::Modality;
+use crate::tokenizer::Tokenizer;
+use crate::training::tokenizer::usage;
+use serde::Serialize;
+use std::collections::BTreeMap;
+
+/// Clips scored at a time.
+const CHUNK: usize = 32;
+
+/// What has to be beaten.
+pub(super) struct Baselines<'a> {
+    /// The mean of the training split, one value per value of a signal.
+    pub mean: Vec<f32>,
+    /// The signal as a codebook of the same size without a network gives it back, where there is one.
+    pub codebook: &'a dyn Fn(&Signal) -> Option<Vec<f32>>,
+}
+
+/// Errors on held-out clips by metric; the name says the unit.
+#[derive(Debug, Clone, Default, Serialize)]
+pub(super) struct Scores {
+    /// Held-out clips that have the modality.
+    pub clips: usize,
+    /// Of the tokenizer.
+    pub reconstruction: BTreeMap<String, f64>,
+    /// Of always predicting the mean of the training split.
+    pub mean: BTreeMap<String, f64>,
+    /// Of k-means with as many codes on the same patches; empty where there is none.
+    pub kmeans: BTreeMap<String, f64>,
+    /// Tokens of all clips together.
+    pub tokens: u64,
+    /// Share of the codes that occur in them; bounded by `tokens / vocabulary`.
+    pub usage: Option<f64>,
+    /// `exp` of the entropy of their frequencies.
+    pub perplexity: Option<f64>,
+}
+
+impl Scores {
+    /// Into the metrics of the stage, at its last step.
+    pub(super) fn record(
+        &self,
+        step: u64,
+        context: &mut dyn StageContext,
+    ) -> Result<(), StageError> {
+        let mut scalars = Vec::new();
+        for (kind, errors) in [
+            ("validation", &self.reconstruction),
+            ("baseline_mean", &self.mean),
+            ("baseline_kmeans", &self.kmeans),
+        ] {
+            scalars.extend(errors.iter().map(|(name, v)| (format!("{kind}/{name}"), *v)));
+        }
+        for (name, value) in [("usage", self.usage), ("perplexity", self.perplexity)] {
+            scalars.extend(value.map(|value| (format!("codes/{name}"), value)));
+        }
+        let scalars: Vec<(&str, f64)> = scalars.iter().map(|(n, v)| (n.as_str(), *v)).collect();
+        if scalars.is_empty() {
+            return Ok(());
+        }
+        context.record(step, &scalars)
+    }
+}
+
+/// Scores `tokenizer` on the first `most` clips of `set` that have the modality.
+pub(super) fn score(
+    set: &ClipSet,
+    most: usize,
+    modality: &dyn Modality,
+    tokenizer: &dyn Tokenizer,
+    baselines: &Baselines<'_>,
+    context: &mut dyn StageContext,
+) -> Result<Scores, StageError> {
+    let beside: &[&str] = match modality.name() {
+        "gaze" => &["camera"],
+        _ => &[],
+    };
+    let (mut own, mut mean, mut kmeans) =
+        (Errors::default(), Errors::default(), Errors::default());
+    let mut ids = Vec::new();
+    let mut clips = 0;
+    for start in (0..most).step_by(CHUNK) {
+        if context.interrupted() {
+            return Err(StageError::Interrupted);
+        }
+        let end = (start + CHUNK).min(most);
+        let found = extract(set, modality, beside, start..end)?;
+        let signals: Vec<Signal> = found.iter().map(|found| found.signal.clone()).collect();
+        let grids = tokenizer.encode(&signals).map_err(StageError::other)?;
+        let decoded = tokenizer.decode(&grids).map_err(StageError::other)?;
+        for (Extracted { clip, signal }, decoded) in found.iter().zip(decoded) {
+            let values: Vec<f32> = decoded.values.iter().copied().collect();
+            own.compare(modality, clip, signal, &values);
+            mean.compare(modality, clip, signal, &baselines.mean);
+            if let Some(values) = (baselines.codebook)(signal) {
+                kmeans.compare(modality, clip, signal, &values);
+            }
+        }
+        ids.extend(grids.into_iter().flat_map(|grid| grid.ids));
+        clips += found.len();
+        context.progress(end as u64, most as u64, "held-out clips");
+    }
+    let tokens = ids.len() as u64;
+    let used = (tokens > 0).then(|| usage(ids, tokenizer.vocabulary()));
+    Ok(Scores {
+        clips,
+        reconstruction: own.means(),
+        mean: mean.means(),
+        kmeans: kmeans.means(),
+        tokens,
+        usage: used.map(|used| used.used),
+        perplexity: used.map(|used| used.perplexity),
+    })
+}

@@ -1,0 +1,114 @@
+//! A video tokenizer as one safetensors file: the network's weights, and what it works on as metadata.
+
+use std::path::Path;
+
+use super::{Network, VideoSettings, VideoTokenizer};
+use crate::engine::{Compute, Initialise, Parameters, Weights};
+use crate::tokenizer::trained::FILE;
+use crate::tokenizer::{Tokenizer, TokenizerError};
+
+/// What the file says it is.
+pub const FORMAT: &str = "reviv video tokenizer 1";
+
+impl VideoTokenizer {
+    /// Weights by name; settings, modality and clip size as metadata.
+    #[must_use]
+    pub fn weights(&self) -> Weights {
+        let mut weights = self.network().weights();
+        let settings = serde_json::to_string(self.settings()).unwrap_or_default();
+        let [frames, height, width] = self.clip();
+        weights.metadata = [
+            ("format", FORMAT.to_owned()),
+            ("modality", self.modality().to_owned()),
+            ("clip", format!("[{frames},{height},{width}]")),
+            ("settings", settings),
+        ]
+        .map(|(key, value)| (key.to_owned(), value))
+        .into();
+        weights
+    }
+
+    /// Rebuilds a tokenizer from [`VideoTokenizer::weights`].
+    ///
+    /// # Errors
+    /// When the file is of another format, or its tensors are not those of its settings.
+    pub fn from_weights(weights: Weights, compute: &Compute) -> Result<Self, TokenizerError> {
+        let text = |key: &str| -> Result<&str, TokenizerError> {
+            weights
+                .metadata
+                .get(key)
+                .map(String::as_str)
+                .ok_or_else(|| {
+                    TokenizerError::Other(format!(
+                        "the file does not say its `{key}`: it is no tokenizer of reviv"
+                    ))
+                })
+        };
+        if text("format")? != FORMAT {
+            return Err(TokenizerError::Other(format!(
+                "the file is `{}`, expected `{FORMAT}`",
+                text("format")?
+            )));
+        }
+        let modality = text("modality")?.to_owned();
+        let wrong = |what: &str, reason: String| {
+            TokenizerError::Other(format!("{modality}: {what}: {reason}"))
+        };
+        let settings: VideoSettings = serde_json::from_str(text("settings")?)
+            .map_err(|error| wrong("settings", error.to_string()))?;
+        let clip: [usize; 3] = serde_json::from_str(text("clip")?)
+            .map_err(|error| wrong("clip", error.to_string()))?;
+        let mut network = Network::new(&Initialise::to_load(compute), &settings)?;
+        network
+            .load(&weights)
+            .map_err(|error| wrong("weights", error.to_string()))?;
+        Self::new(&modality, clip, network, compute)
+    }
+
+    /// Writes `tokenizer.safetensors` into `directory`; equal tokenizers give equal bytes.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub fn write(&self, directory: &Path) -> Result<(), TokenizerError> {
+        self.weights()
+            .write(&directory.join(FILE))
+            .map_err(|error| TokenizerError::Other(error.to_string()))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::clip::Signal;
+    use ndarray::{ArrayD, IxDyn};
+
+    #[test]
+    fn a_stored_tokenizer_gives_the_same_tokens() {
+        let settings = VideoSettings {
+            channels: 4,
+            multipliers: vec![1, 2],
+            blocks: 1,
+            latent_channels: 4,
+            levels: vec![4, 3],
+            ..VideoSettings::default()
+        };
+        let compute = Compute::cpu();
+        let network = Network::new(&Initialise::new(&compute, 2), &settings).unwrap();
+        let one = VideoTokenizer::new("rgb", [4, 16, 16], network, &compute).unwrap();
+        let folder = tempfile::tempdir().unwrap();
+        one.write(folder.path()).unwrap();
+        let other = crate::tokenizer::open(folder.path()).unwrap();
+        let values = ArrayD::from_shape_fn(IxDyn(&[4, 16, 16, 3]), |at| {
+            ((at[0] * 7 + at[1] * 3 + at[2]) as f32 * 0.1).sin()
+        });
+        let signal = Signal {
+            values,
+            valid: None,
+        };
+        assert_eq!(other.modality(), "rgb");
+        assert_eq!(
+            other.encode(std::slice::from_ref(&signal)).unwrap(),
+            one.encode(&[signal]).unwrap()
+        );
+    }
+}
