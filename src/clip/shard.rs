@@ -203,6 +203,13 @@ impl Shards {
         self.modalities.get(modality).map_or(0, BTreeMap::len)
     }
 
+    /// Whether the sample has the modality.
+    pub fn has(&self, sample: usize, modality: &str) -> bool {
+        let places = self.modalities.get(modality);
+        let stem = self.samples.get(sample);
+        stem.is_some_and(|stem| places.is_some_and(|places| places.contains_key(stem)))
+    }
+
     /// The bytes of one member; `None` where the sample lacks the modality.
     ///
     /// # Errors
