@@ -1,10 +1,11 @@
 //! The ops of the experiment language: one file per op, with its settings, its ports and what it runs.
 
-pub mod clips;
 mod clip_signals;
+pub mod clips;
 mod evaluate;
 mod kinds;
 mod table;
+pub mod tokenize;
 pub mod tokenizer_entry;
 pub mod train_mget;
 pub mod train_tokenizer;

@@ -17,8 +17,8 @@ use crate::experiment::{
     StageContext, StageError, StagePlan, TokenFacts, TokenPlan,
 };
 use crate::modality::Shape;
-use crate::tokenizer::video::padding::Padding;
 use crate::tokenizer::video::Network;
+use crate::tokenizer::video::padding::Padding;
 use crate::tokenizer::vq::VqVae;
 use crate::training::AdamWSettings;
 use crate::training::tokenizer::TokenizerTraining;
@@ -147,10 +147,8 @@ impl Op for TrainTokenizer {
         };
         if settings.modality.is_empty() {
             problems.push(
-                Problem::new(Code::E0204, "modality", "the modality is not named").help(format!(
-                    "the clips have: {}",
-                    names(clips.signals.keys())
-                )),
+                Problem::new(Code::E0204, "modality", "the modality is not named")
+                    .help(format!("the clips have: {}", names(clips.signals.keys()))),
             );
             return Description::default();
         }
@@ -167,7 +165,10 @@ impl Op for TrainTokenizer {
             return Description::default();
         };
         if settings.warmup > settings.steps {
-            let message = format!("{} warm-up steps in a run of {}", settings.warmup, settings.steps);
+            let message = format!(
+                "{} warm-up steps in a run of {}",
+                settings.warmup, settings.steps
+            );
             problems.push(Problem::new(Code::E0206, "warmup", message));
         }
         if !(settings.rate.is_finite() && settings.rate > 0.0) {
@@ -178,7 +179,11 @@ impl Op for TrainTokenizer {
             let problem = Problem::new(Code::E0401, "clips", "the clips have no `train` split");
             problems.push(problem.help("give the clips stage `train:` a number"));
         }
-        if clips.clips.get("validation").is_none_or(|count| *count == 0) {
+        if clips
+            .clips
+            .get("validation")
+            .is_none_or(|count| *count == 0)
+        {
             let problem = Problem::new(Code::W0701, "clips", "no held-out clips to score on");
             problems.push(problem.help("give the clips stage `validation:` a number"));
         }
@@ -191,7 +196,9 @@ impl Op for TrainTokenizer {
             },
             Err(message) => {
                 let help = match modality.shape() {
-                    Shape::Temporal { .. } => "signals over time take `vq_temporal_small` and its like",
+                    Shape::Temporal { .. } => {
+                        "signals over time take `vq_temporal_small` and its like"
+                    }
                     Shape::Kinematic { .. } => "joints take `vq_kinematic_small` and its like",
                     Shape::Video { .. } => "video takes `video_small` and its like",
                 };
@@ -207,7 +214,10 @@ impl Op for TrainTokenizer {
         inputs: &Inputs<'_>,
         _seed: u64,
     ) -> StagePlan {
-        let format = inputs.one("clips").and_then(described_format).unwrap_or_default();
+        let format = inputs
+            .one("clips")
+            .and_then(described_format)
+            .unwrap_or_default();
         let Some(modality) = modality(&format, &settings.modality) else {
             return StagePlan::default();
         };
@@ -226,7 +236,10 @@ impl Op for TrainTokenizer {
         };
         StagePlan {
             shapes: vec![
-                ("signal".to_owned(), super::clips::shape_of(modality.as_ref())),
+                (
+                    "signal".to_owned(),
+                    super::clips::shape_of(modality.as_ref()),
+                ),
                 ("tokens".to_owned(), tokens.grid.clone()),
             ],
             parameters,
@@ -375,8 +388,17 @@ mod tests {
         let key = |settings| check(settings).1[0].key.clone();
         let vq = json!({"use": "vq", "family": "vq", "compression": [2]});
         assert_eq!(key(json!({"tokenizer": vq})), "modality");
-        assert_eq!(key(json!({"modality": "bodi", "tokenizer": vq})), "modality");
-        assert_eq!(key(json!({"modality": "body", "tokenizer": vq})), "tokenizer");
-        assert_eq!(key(json!({"modality": "rgb", "tokenizer": vq})), "tokenizer");
+        assert_eq!(
+            key(json!({"modality": "bodi", "tokenizer": vq})),
+            "modality"
+        );
+        assert_eq!(
+            key(json!({"modality": "body", "tokenizer": vq})),
+            "tokenizer"
+        );
+        assert_eq!(
+            key(json!({"modality": "rgb", "tokenizer": vq})),
+            "tokenizer"
+        );
     }
 }

@@ -3,8 +3,8 @@
 use std::path::Path;
 
 use super::trained::{self, VqTokenizer};
-use super::video::stored;
 use super::video::VideoTokenizer;
+use super::video::stored;
 use super::{Tokenizer, TokenizerError};
 use crate::engine::{Compute, Weights};
 
@@ -20,13 +20,9 @@ pub fn open(directory: &Path) -> Result<Box<dyn Tokenizer>, TokenizerError> {
 ///
 /// # Errors
 /// As [`open`].
-pub fn open_on(
-    directory: &Path,
-    compute: &Compute,
-) -> Result<Box<dyn Tokenizer>, TokenizerError> {
+pub fn open_on(directory: &Path, compute: &Compute) -> Result<Box<dyn Tokenizer>, TokenizerError> {
     let path = directory.join(trained::FILE);
-    let weights =
-        Weights::read(&path).map_err(|error| TokenizerError::Other(error.to_string()))?;
+    let weights = Weights::read(&path).map_err(|error| TokenizerError::Other(error.to_string()))?;
     let format = weights.metadata.get("format").map(String::as_str);
     if format == Some(stored::FORMAT) {
         return Ok(Box::new(VideoTokenizer::from_weights(weights, compute)?));

@@ -379,7 +379,9 @@ mod tests {
     #[test]
     fn every_signal_is_seen_once_per_epoch() {
         let mut trainer = trainer(50);
-        let seen: Vec<usize> = (0..5).flat_map(|step| trainer.epochs.choose(step, 20)).collect();
+        let seen: Vec<usize> = (0..5)
+            .flat_map(|step| trainer.epochs.choose(step, 20))
+            .collect();
         for epoch in seen.chunks(20) {
             let mut epoch = epoch.to_vec();
             epoch.sort_unstable();

@@ -88,7 +88,10 @@ impl Errors {
                 for (truth, found) in rows {
                     self.add("distance_percent", 100.0 * distance(truth, found));
                     if let Some(intrinsics) = &intrinsics {
-                        self.add("angle_deg", angle(&ray(intrinsics, truth), &ray(intrinsics, found)));
+                        self.add(
+                            "angle_deg",
+                            angle(&ray(intrinsics, truth), &ray(intrinsics, found)),
+                        );
                     }
                 }
             }

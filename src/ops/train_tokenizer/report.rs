@@ -41,7 +41,10 @@ pub(super) fn markdown(
     );
     for (name, value) in &scores.reconstruction {
         let words = METRICS.iter().find(|(metric, _)| metric == name);
-        let words = words.map_or_else(|| name.replace("rmse_", "RMSE of channel "), |(_, words)| (*words).to_owned());
+        let words = words.map_or_else(
+            || name.replace("rmse_", "RMSE of channel "),
+            |(_, words)| (*words).to_owned(),
+        );
         let other = |errors: &std::collections::BTreeMap<String, f64>| {
             errors
                 .get(name)

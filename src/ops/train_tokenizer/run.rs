@@ -50,7 +50,10 @@ pub(super) fn run(
         .ok_or_else(|| damaged("no clips arrived"))?;
     let format = format(&clips)?;
     let modality = modality(&format, &settings.modality).ok_or_else(|| {
-        damaged(&format!("the clips have no modality `{}`", settings.modality))
+        damaged(&format!(
+            "the clips have no modality `{}`",
+            settings.modality
+        ))
     })?;
     let data = Data {
         train: open_split(&clips.path, "train")?
@@ -93,8 +96,13 @@ fn train_vq(
     let model = VqVae::new(&Initialise::new(&compute, context.seed()), sizes, &shape)
         .map_err(StageError::other)?;
     let signals = read_signals(settings, data, context)?;
-    let normaliser = normaliser(settings, data, &signals, model.patches().values_per_sample())
-        .map_err(StageError::other)?;
+    let normaliser = normaliser(
+        settings,
+        data,
+        &signals,
+        model.patches().values_per_sample(),
+    )
+    .map_err(StageError::other)?;
     let prepared = prepare(&settings.modality, &model, &normaliser, &signals)
         .map_err(|error| damaged(&error.to_string()))?;
     drop(signals);
@@ -173,7 +181,10 @@ fn train_video(
     let having: Vec<usize> = (0..data.train.len())
         .filter(|index| data.train.shards().has(*index, &settings.modality))
         .collect();
-    context.log(&format!("{count} parameters, {} training videos", having.len()));
+    context.log(&format!(
+        "{count} parameters, {} training videos",
+        having.len()
+    ));
     let trainer = VideoTrainer::new(model, &settings.training(), context.seed())
         .map_err(|error| failed(error, settings))?;
     let mut training = VideoTraining {
@@ -192,11 +203,16 @@ fn train_video(
         for found in extract(&data.train, modality, &[], *index..index + 1)? {
             seen += 1.0;
             let values = found.signal.values.iter();
-            mean.iter_mut().zip(values).for_each(|(m, v)| *m += f64::from(*v));
+            mean.iter_mut()
+                .zip(values)
+                .for_each(|(m, v)| *m += f64::from(*v));
         }
     }
     let baselines = Baselines {
-        mean: mean.iter().map(|sum| (sum / f64::max(seen, 1.0)) as f32).collect(),
+        mean: mean
+            .iter()
+            .map(|sum| (sum / f64::max(seen, 1.0)) as f32)
+            .collect(),
         codebook: &|_| None,
     };
     let scores = hold_out(settings, data, &tokenizer, &baselines, context)?;
@@ -261,7 +277,14 @@ fn hold_out(
         return Ok(Scores::default());
     };
     let most = settings.validation_clips.min(set.len());
-    score(set, most, data.modality.as_ref(), tokenizer, baselines, context)
+    score(
+        set,
+        most,
+        data.modality.as_ref(),
+        tokenizer,
+        baselines,
+        context,
+    )
 }
 
 /// What both families have in common between two steps.

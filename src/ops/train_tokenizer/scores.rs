@@ -54,7 +54,11 @@ impl Scores {
             ("baseline_mean", &self.mean),
             ("baseline_kmeans", &self.kmeans),
         ] {
-            scalars.extend(errors.iter().map(|(name, v)| (format!("{kind}/{name}"), *v)));
+            scalars.extend(
+                errors
+                    .iter()
+                    .map(|(name, v)| (format!("{kind}/{name}"), *v)),
+            );
         }
         for (name, value) in [("usage", self.usage), ("perplexity", self.perplexity)] {
             scalars.extend(value.map(|value| (format!("codes/{name}"), value)));
@@ -80,8 +84,7 @@ pub(super) fn score(
         "gaze" => &["camera"],
         _ => &[],
     };
-    let (mut own, mut mean, mut kmeans) =
-        (Errors::default(), Errors::default(), Errors::default());
+    let (mut own, mut mean, mut kmeans) = (Errors::default(), Errors::default(), Errors::default());
     let mut ids = Vec::new();
     let mut clips = 0;
     for start in (0..most).step_by(CHUNK) {

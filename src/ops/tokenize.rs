@@ -1,0 +1,368 @@
+//! `op: tokenize`: clips become token grids, once for all models that train on them (Sec. 4.2).
+//!
+//! Writes `<split>/<modality>/shard-000000.tar` as [`crate::training::shards`] reads them, `<split>/pixels/` with raw colour
+//! video where it is asked for, and every tokenizer in `tokenizers/<modality>/`, so that what is trained on the tokens can be
+//! used on its own. A clip without a modality, or with all of it invalid, has no member in that modality's shards. A shard
+//! that is complete survives an interruption.
+
+use super::clip_signals::{SPLITS, damaged, extract, format, modality, open_split};
+use crate::clip::shard::{ShardError, ShardWriter, TOKENS_PER_SHARD};
+use crate::clip::store::{ClipSet, tokens_to_bytes};
+use crate::experiment::{
+    Arity, ArtifactKind, Code, Description, Inputs, Op, OpEntry, Port, Problem, StageContext,
+    StageError, StagePlan, TokenFacts, TokenPlan,
+};
+use crate::formats::npz::Npz;
+use crate::masking::PIXELS;
+use crate::modality::Modality;
+use crate::tokenizer::{self, Tokenizer};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use serde_json::{Value, json};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// Clips tokenized at a time.
+const CHUNK: usize = 16;
+
+/// Whether raw video travels with the tokens.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum RawVideo {
+    /// Tokens alone.
+    #[default]
+    None,
+    /// Colour video as bytes, for models that see pixels.
+    Rgb,
+}
+
+/// Settings of [`Tokenize`].
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct TokenizeSettings {
+    /// The modalities to tokenize; empty means all that have a tokenizer.
+    pub modalities: Vec<String>,
+    /// Raw video beside the tokens.
+    pub pixels: RawVideo,
+}
+
+impl TokenizeSettings {
+    fn takes(&self, modality: &str) -> bool {
+        self.modalities.is_empty() || self.modalities.iter().any(|name| name == modality)
+    }
+}
+
+/// The op.
+#[derive(Debug)]
+pub struct Tokenize;
+inventory::submit! { OpEntry(&Tokenize) }
+
+impl Op for Tokenize {
+    type Settings = TokenizeSettings;
+
+    fn name(&self) -> &'static str {
+        "tokenize"
+    }
+
+    fn version(&self) -> u32 {
+        1
+    }
+
+    fn about(&self) -> &'static str {
+        "Turns clips into token grids, by split and modality."
+    }
+
+    fn inputs(&self) -> &'static [Port] {
+        &[
+            Port {
+                name: "clips",
+                kinds: &[ArtifactKind::Clips],
+                arity: Arity::One,
+                about: "what to tokenize",
+            },
+            Port {
+                name: "tokenizers",
+                kinds: &[ArtifactKind::Tokenizer],
+                arity: Arity::Many,
+                about: "one per modality",
+            },
+        ]
+    }
+
+    fn output(&self) -> ArtifactKind {
+        ArtifactKind::Tokens
+    }
+
+    fn seeded(&self) -> bool {
+        false
+    }
+
+    fn check(
+        &self,
+        settings: &TokenizeSettings,
+        inputs: &Inputs<'_>,
+        problems: &mut Vec<Problem>,
+    ) -> Description {
+        let Some(clips) = inputs.one("clips") else {
+            return Description::default();
+        };
+        let mut tokens: BTreeMap<String, TokenFacts> = BTreeMap::new();
+        for (i, input) in inputs.all("tokenizers").iter().enumerate() {
+            for (name, facts) in &input.description.tokens {
+                let key = format!("tokenizers.{i}");
+                let found = clips.signals.get(name);
+                let fitted = input.description.signals.get(name);
+                if let (Some(found), Some(fitted)) = (found, fitted)
+                    && found.shape != fitted.shape
+                {
+                    problems.push(Problem::new(
+                        Code::E0401,
+                        &key,
+                        format!(
+                            "`{}` was trained on `{name}` of shape {:?}, the clips have {:?}",
+                            input.stage, fitted.shape, found.shape
+                        ),
+                    ));
+                }
+                if found.is_none() {
+                    problems.push(super::clip_signals::unknown_modality(key, name, clips));
+                } else if tokens.insert(name.clone(), facts.clone()).is_some() {
+                    let message = format!("two tokenizers of `{name}`");
+                    problems.push(Problem::new(Code::E0205, key, message));
+                }
+            }
+        }
+        for (i, name) in settings.modalities.iter().enumerate() {
+            if !tokens.contains_key(name) {
+                let known: Vec<&str> = tokens.keys().map(String::as_str).collect();
+                let message = format!("modality `{name}` has no tokenizer");
+                problems.push(
+                    Problem::new(Code::E0203, format!("modalities.{i}"), message)
+                        .help(format!("there are tokenizers of: {}", known.join(", "))),
+                );
+            }
+        }
+        tokens.retain(|name, _| settings.takes(name));
+        let mut extra = BTreeMap::new();
+        if let Some(format) = clips.extra.get("format") {
+            extra.insert("format".to_owned(), format.clone());
+        }
+        if settings.pixels == RawVideo::Rgb {
+            match clips.signals.get("rgb") {
+                Some(facts) => {
+                    extra.insert(PIXELS.to_owned(), json!(facts.shape));
+                }
+                None => problems.push(Problem::new(
+                    Code::E0401,
+                    "pixels",
+                    "the clips have no `rgb`",
+                )),
+            }
+        }
+        Description {
+            clips: clips.clips.clone(),
+            signals: clips.signals.clone(),
+            tokens,
+            extra,
+            ..Description::default()
+        }
+    }
+
+    fn plan(&self, settings: &TokenizeSettings, inputs: &Inputs<'_>, _seed: u64) -> StagePlan {
+        let mut problems = Vec::new();
+        let found = self.check(settings, inputs, &mut problems);
+        let clips: u64 = found.clips.values().sum();
+        let tokens: u64 = found.tokens.values().map(TokenFacts::count).sum();
+        let pixels: u64 = match settings.pixels {
+            RawVideo::None => 0,
+            RawVideo::Rgb => found
+                .signals
+                .get("rgb")
+                .map_or(0, |facts| facts.shape.iter().map(|n| *n as u64).product()),
+        };
+        // Eight bytes per token, and the headers of a member.
+        let member = 8 * tokens + 2048 * found.tokens.len() as u64;
+        StagePlan {
+            tokens: found
+                .tokens
+                .iter()
+                .map(|(name, facts)| TokenPlan {
+                    modality: name.clone(),
+                    tokens: facts.count(),
+                    vocabulary: facts.vocabulary,
+                    mean_input: None,
+                    mean_target: None,
+                })
+                .collect(),
+            work: Some((clips, "clips".to_owned())),
+            disk: Some(clips * (member + pixels)),
+            ..StagePlan::default()
+        }
+    }
+
+    fn run(
+        &self,
+        settings: &TokenizeSettings,
+        context: &mut dyn StageContext,
+    ) -> Result<Value, StageError> {
+        let clips = context
+            .inputs("clips")
+            .first()
+            .cloned()
+            .ok_or_else(|| damaged("no clips arrived"))?;
+        let format = format(&clips)?;
+        let mut writers = Vec::new();
+        let mut tokens = BTreeMap::new();
+        for artifact in context.inputs("tokenizers").to_vec() {
+            let tokenizer =
+                tokenizer::open(&artifact.path).map_err(|error| damaged(&error.to_string()))?;
+            let name = tokenizer.modality().to_owned();
+            if !settings.takes(&name) {
+                continue;
+            }
+            let modality = modality(&format, &name)
+                .ok_or_else(|| damaged(&format!("the clips have no modality `{name}`")))?;
+            let facts = TokenFacts {
+                grid: tokenizer.grid().to_vec(),
+                vocabulary: tokenizer.vocabulary() as u64,
+            };
+            tokens.insert(name.clone(), facts);
+            let place = context.output().join("tokenizers").join(name);
+            deliver(&artifact.path, &place, false)?;
+            writers.push(Writer {
+                modality,
+                tokenizer,
+            });
+        }
+        let mut sets = Vec::new();
+        for split in SPLITS {
+            if let Some(set) = open_split(&clips.path, split)? {
+                sets.push((split, set));
+            }
+        }
+        let total: usize = sets.iter().map(|(_, set)| set.len()).sum();
+        let mut done = 0;
+        let mut splits = serde_json::Map::new();
+        for (split, set) in &sets {
+            let folder = context.checkpoints().join("tokens").join(split);
+            std::fs::create_dir_all(&folder).map_err(StageError::io(&folder))?;
+            for start in (0..set.len()).step_by(TOKENS_PER_SHARD) {
+                let end = (start + TOKENS_PER_SHARD).min(set.len());
+                let number = (start / TOKENS_PER_SHARD) as u32;
+                let marker = folder.join(format!("shard-{number:06}.done"));
+                if !marker.exists() {
+                    let mut shard = ShardWriter::new(&folder, number);
+                    for from in (start..end).step_by(CHUNK) {
+                        if context.interrupted() {
+                            return Err(StageError::Interrupted);
+                        }
+                        let to = (from + CHUNK).min(end);
+                        for writer in &writers {
+                            writer.add(set, from..to, &mut shard)?;
+                        }
+                        if settings.pixels == RawVideo::Rgb {
+                            add_pixels(set, from..to, &mut shard)?;
+                        }
+                        context.progress((done + to - start) as u64, total as u64, "clips");
+                    }
+                    shard.finish().map_err(StageError::other)?;
+                    std::fs::write(&marker, b"").map_err(StageError::io(&marker))?;
+                }
+                done += end - start;
+                context.progress(done as u64, total as u64, "clips");
+            }
+            splits.insert((*split).to_owned(), json!({ "clips": set.len() }));
+        }
+        for (split, _) in &sets {
+            let folder = context.checkpoints().join("tokens").join(split);
+            deliver(&folder, &context.output().join(split), true)?;
+        }
+        // The shards are gone from here: their markers must not outlive them.
+        let kept = context.checkpoints().join("tokens");
+        std::fs::remove_dir_all(&kept).map_err(StageError::io(&kept))?;
+        let mut contents = json!({ "tokens": tokens, "splits": splits, "format": format });
+        if settings.pixels == RawVideo::Rgb {
+            contents[PIXELS] = json!([format.frames, format.size, format.size, 3]);
+        }
+        Ok(contents)
+    }
+}
+
+/// One modality's way into the shards.
+struct Writer {
+    modality: Box<dyn Modality>,
+    tokenizer: Box<dyn Tokenizer>,
+}
+
+impl Writer {
+    fn add(
+        &self,
+        set: &ClipSet,
+        range: std::ops::Range<usize>,
+        shard: &mut ShardWriter,
+    ) -> Result<(), StageError> {
+        let found = extract(set, self.modality.as_ref(), &[], range)?;
+        let (clips, signals): (Vec<_>, Vec<_>) = found
+            .into_iter()
+            .map(|found| (found.clip.id, found.signal))
+            .unzip();
+        let grids = self
+            .tokenizer
+            .encode(&signals)
+            .map_err(|error| damaged(&error.to_string()))?;
+        for (id, grid) in clips.iter().zip(grids) {
+            let bytes = tokens_to_bytes(&grid.ids, &grid.grid).map_err(StageError::other)?;
+            shard
+                .add(self.modality.name(), id, &bytes)
+                .map_err(StageError::other)?;
+        }
+        Ok(())
+    }
+}
+
+fn add_pixels(
+    set: &ClipSet,
+    range: std::ops::Range<usize>,
+    shard: &mut ShardWriter,
+) -> Result<(), StageError> {
+    for index in range {
+        let clip = set
+            .clip_with(index, &["rgb"])
+            .map_err(|error: ShardError| damaged(&error.to_string()))?;
+        if let Some(rgb) = &clip.rgb {
+            let bytes = Npz::default()
+                .with("arr_0", &rgb.frames)
+                .to_bytes()
+                .map_err(StageError::other)?;
+            shard
+                .add(PIXELS, &clip.id, &bytes)
+                .map_err(StageError::other)?;
+        }
+    }
+    Ok(())
+}
+
+/// Copies (or moves) a folder without what describes it as an artifact: its manifest, its page, and the markers of finished shards.
+fn deliver(from: &Path, to: &Path, moves: bool) -> Result<(), StageError> {
+    std::fs::create_dir_all(to).map_err(StageError::io(to))?;
+    let mut paths: Vec<PathBuf> = Vec::new();
+    for entry in std::fs::read_dir(from).map_err(StageError::io(from))? {
+        paths.push(entry.map_err(StageError::io(from))?.path());
+    }
+    for path in paths {
+        let Some(name) = path.file_name() else {
+            continue;
+        };
+        let leaves_out = name == "manifest.json" || name == "report";
+        let target = to.join(name);
+        if leaves_out || path.extension().is_some_and(|e| e == "done" || e == "part") {
+            continue;
+        }
+        if path.is_dir() {
+            deliver(&path, &target, moves)?;
+        } else if !moves || std::fs::rename(&path, &target).is_err() {
+            std::fs::copy(&path, &target).map_err(StageError::io(&path))?;
+        }
+    }
+    Ok(())
+}
