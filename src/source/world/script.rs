@@ -130,9 +130,6 @@ pub fn write(
         t += blinks.random_range(1.8..5.5);
     }
     writer.plan.gaze.sort_by(|a, b| a.start.total_cmp(&b.start));
-    for hold in &mut writer.plan.holds {
-        hold.end = hold.end.min(seconds + 1.0);
-    }
     writer.plan
 }
 
