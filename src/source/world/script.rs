@@ -147,30 +147,38 @@ struct Writer<'a> {
 impl Writer<'_> {
     fn next_activity(&mut self, rng: &mut StreamRng) {
         let free_hand = self.carried.iter().any(Option::is_none);
+        let before = self.plan.gaze.len();
         let in_reach = self
             .spot
             .is_some_and(|s| !self.scene.spots[s].objects.is_empty());
         match rng.random_range(0..100) {
-            0..=49 if in_reach && free_hand => self.manipulate(rng),
-            50..=58 => self.look_around(rng),
-            59..=69 if self.carried == [None, None] => self.gesture(rng),
-            70..=75 => self.crouch_down(rng),
+            0..=47 if in_reach && free_hand => self.manipulate(rng),
+            48..=52 => self.look_around(rng),
+            53..=61 if self.carried == [None, None] => self.gesture(rng),
+            62..=66 => self.crouch_down(rng),
             _ => self.walk(rng),
         }
-        self.glance(rng);
+        self.glances(rng, before);
         self.now += rng.random_range(0.0..0.35);
     }
 
-    /// Eyes never rest for long: a short look aside and back.
-    fn glance(&mut self, rng: &mut StreamRng) {
-        let Some(last) = self.plan.gaze.last().copied() else {
-            return;
-        };
-        if self.now - last.start > 0.9 {
-            let aside = Look::Ahead(rng.random_range(-0.3..0.3), rng.random_range(0.1..0.6));
-            let start = last.start + rng.random_range(0.3..0.5);
-            self.look(start, aside);
-            self.look(start + rng.random_range(0.2..0.35), last.look);
+    /// Eyes never rest for long: short looks aside and back wherever the activity since fixation `from` left them on one thing.
+    fn glances(&mut self, rng: &mut StreamRng, from: usize) {
+        let (earlier, new) = self.plan.gaze.split_at(from);
+        let latest = earlier.iter().max_by(|a, b| a.start.total_cmp(&b.start));
+        // The latest fixation goes on into this activity.
+        let mut since: Vec<Fixation> = latest.into_iter().chain(new).copied().collect();
+        since.sort_by(|a, b| a.start.total_cmp(&b.start));
+        for (i, fixation) in since.iter().enumerate() {
+            let end = since.get(i + 1).map_or(self.now, |next| next.start);
+            let mut t = fixation.start.max(0.0) + rng.random_range(0.45..0.8);
+            while t < end - 0.5 {
+                let aside = Look::Ahead(rng.random_range(-0.3..0.3), rng.random_range(0.1..0.6));
+                let back = t + rng.random_range(0.2..0.35);
+                self.look(t, aside);
+                self.look(back, fixation.look);
+                t = back + rng.random_range(0.5..1.1);
+            }
         }
     }
 
@@ -503,7 +511,7 @@ impl Writer<'_> {
             start: held - 0.04,
             end: f64::INFINITY,
         };
-        if rng.random_bool(0.3) {
+        if rng.random_bool(0.15) {
             self.carried[side] = Some(object);
             self.now = t;
         } else {
