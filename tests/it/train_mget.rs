@@ -143,7 +143,7 @@ fn settings(loader_threads: usize) -> TrainMgetSettings {
     };
     settings.masking.settings.input_tokens = TokenBudget::Fixed(8);
     settings.masking.settings.target_tokens = TokenBudget::Fixed(8);
-    settings.training.steps = Some(120);
+    settings.training.steps = Some(200);
     settings.training.batch = 12;
     settings.training.micro_batch = 5;
     settings.training.learning_rate = 5e-3;
@@ -178,7 +178,7 @@ fn an_interrupted_run_continues_to_the_same_bytes() {
     let expected_weights = context.weights();
 
     let folder = tempfile::tempdir().unwrap();
-    for (interrupt_after, threads) in [(3, 2), (50, 1), (51, 4)] {
+    for (interrupt_after, threads) in [(3, 2), (90, 1), (91, 4)] {
         let mut context = Context::new(folder.path());
         context.interrupt_after = interrupt_after;
         let error = TrainMget.run(&settings(threads), &mut context).unwrap_err();

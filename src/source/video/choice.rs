@@ -28,7 +28,9 @@ impl Schedule {
             .enumerate()
             .all(|(k, tick)| ((tick - first) as f64 - k as f64 * step).abs() <= UNEVEN * step);
         if even {
-            let fps = tidy(f64::from(timescale) / step);
+            // Either end may have been rounded by half a tick.
+            let slack = 1.0 / (last - first) as f64;
+            let fps = tidy(f64::from(timescale) / step, slack.max(2e-5));
             Schedule::Constant { fps, frames }
         } else {
             let seconds = ticks
@@ -110,14 +112,18 @@ impl Schedule {
 }
 
 /// Rounds away what the container's ticks added to a common rate: 29.9700299 is 30000/1001.
-fn tidy(fps: f64) -> f64 {
-    for base in [1.0, 1.001] {
-        let whole = (fps * base).round();
-        if whole >= 1.0 && (fps * base / whole - 1.0).abs() < 2e-5 {
-            return whole / base;
-        }
-    }
-    fps
+/// `slack` is how far, as a share, the rate may be off.
+fn tidy(fps: f64, slack: f64) -> f64 {
+    // 30 and 30/1.001 lie within the slack of a short video together: the nearer one is meant.
+    let off = |rate: f64| (fps / rate - 1.0).abs();
+    [1.0, 1.001]
+        .map(|base| ((fps * base).round(), base))
+        .into_iter()
+        .filter(|(whole, _)| *whole >= 1.0)
+        .map(|(whole, base)| whole / base)
+        .filter(|rate| off(*rate) < slack)
+        .min_by(|a, b| off(*a).total_cmp(&off(*b)))
+        .unwrap_or(fps)
 }
 
 #[cfg(test)]
