@@ -1,7 +1,7 @@
 //! Iterative parallel decoding (Supp. C): given any tokens, generate any others.
 //!
 //! Read in this order: [`settings`] (a registry entry), [`schedule`] (tokens and temperature per step), [`plan`] (which target
-//! when, from what), [`model`] (what a model must answer), [`filter`] (logits to a token), [`generate`] (**the loop**), [`mget`] (the model).
+//! when, from what), [`model`] (what a model must answer), [`filter`] (logits to a token), [`mod@generate`] (**the loop**), [`mget`] (the model).
 
 pub mod filter;
 pub mod generate;

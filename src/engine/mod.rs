@@ -4,7 +4,7 @@
 //! this order:
 //!
 //! * [`compute`]: which device, which precision, chosen at run time;
-//! * [`parameters`]: how a model holds its numbers, and how they are named, counted, loaded and stored;
+//! * [`mod@parameters`]: how a model holds its numbers, and how they are named, counted, loaded and stored;
 //! * [`weights`]: named arrays on the host and the safetensors files they live in;
 //! * [`initialise`]: where the numbers of a new model come from;
 //! * [`ops`]: linear, layer norm, attention over packed segments, GELU, SwiGLU, cross-entropy, embedding. On the CPU each is one

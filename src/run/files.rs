@@ -16,7 +16,7 @@ pub fn write(path: &Path, bytes: &[u8]) -> Result<(), RunError> {
     sync_directory(parent)
 }
 
-/// [`write`] of pretty-printed JSON with a final newline.
+/// [`write()`] of pretty-printed JSON with a final newline.
 pub fn write_json<T: serde::Serialize>(path: &Path, value: &T) -> Result<(), RunError> {
     let mut text = serde_json::to_vec_pretty(value).map_err(|error| RunError::Malformed {
         path: path.into(),

@@ -1,6 +1,6 @@
 //! The VQ-VAE of camera, gaze, hands and body (Supp. A): patches, transformer, codebook, transformer, patches.
 //!
-//! One model for signals over time ([`super::temporal`]) and for joints over time ([`super::kinematic`]); they differ in how
+//! One model for signals over time (`compression: [2]`) and for joints over time (`compression: [2, 3]`); they differ in how
 //! patches are cut and in the position table. Suffixes: `N` tokens of all samples, `P` values of a patch, `D` width, `L` code
 //! width.
 
