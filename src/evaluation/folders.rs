@@ -1,7 +1,8 @@
-//! True and predicted clips in folders of arrays: how other systems' predictions are evaluated.
+//! True clips, in shards or in folders of arrays, and predictions in folders: what an evaluation reads.
 
 use super::evaluate::{LoadError, Pairs};
 use crate::clip::Clip;
+use crate::clip::store::ClipSet;
 use crate::reconstruction::predictions::Predictions;
 use std::collections::BTreeMap;
 
@@ -50,5 +51,57 @@ impl Pairs for Folders {
             Some(&position) => Ok(Some(self.predictions.load(position)?)),
             None => Ok(None),
         }
+    }
+}
+
+/// True clips in shards and predictions of them, matched by clip id.
+#[derive(Debug)]
+pub struct Stored {
+    ids: Vec<String>,
+    truth: ClipSet,
+    /// Position of a scored clip in `truth` and among the predictions.
+    positions: Vec<(usize, usize)>,
+    predictions: Predictions,
+}
+
+impl Stored {
+    /// Every clip that was predicted is scored.
+    ///
+    /// # Errors
+    /// The id of the first prediction without a true clip.
+    pub fn new(truth: ClipSet, predictions: Predictions) -> Result<Self, String> {
+        let known: BTreeMap<&str, usize> = truth
+            .ids()
+            .iter()
+            .enumerate()
+            .map(|(position, id)| (id.as_str(), position))
+            .collect();
+        let mut positions = Vec::new();
+        let mut ids = Vec::new();
+        for (index, clip) in predictions.index.clips.iter().enumerate() {
+            let position = *known.get(clip.id.as_str()).ok_or_else(|| clip.id.clone())?;
+            positions.push((position, index));
+            ids.push(clip.id.clone());
+        }
+        Ok(Self {
+            ids,
+            truth,
+            positions,
+            predictions,
+        })
+    }
+}
+
+impl Pairs for Stored {
+    fn ids(&self) -> &[String] {
+        &self.ids
+    }
+
+    fn truth(&self, index: usize) -> Result<Clip, LoadError> {
+        Ok(self.truth.clip(self.positions[index].0)?)
+    }
+
+    fn prediction(&self, index: usize) -> Result<Option<Clip>, LoadError> {
+        Ok(Some(self.predictions.load(self.positions[index].1)?))
     }
 }

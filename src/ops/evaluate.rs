@@ -3,9 +3,11 @@
 //! Truth and predictions are folders of [`crate::reconstruction::predictions`]: those of other systems stand in `data.yaml` by
 //! name, so that EgoAllo, HaMeR or EgoM2P can be rows that we computed.
 
+use crate::clip::store::ClipSet;
 use crate::evaluation::compare::{CompareSettings, Entrant, compare};
+use crate::evaluation::evaluate::Pairs;
 use crate::evaluation::evaluate::{Embeddings, EvaluationError, evaluate};
-use crate::evaluation::folders::Folders;
+use crate::evaluation::folders::{Folders, Stored};
 use crate::evaluation::render::{Format, render};
 use crate::evaluation::suite::Suite;
 use crate::experiment::{
@@ -29,8 +31,10 @@ pub struct EvaluateSettings {
     pub suite: Entry<Suite>,
     /// Predictions that no stage makes: a data set of `data.yaml`, a folder of npz files.
     pub predictions_data: Option<String>,
-    /// The true clips: a data set of `data.yaml`, a folder of npz files with the same arrays.
+    /// The true clips where no stage makes them: a data set of `data.yaml`, a folder of npz files with the same arrays.
     pub truth_data: String,
+    /// The split of the stage in `clips` that was predicted.
+    pub split: String,
     /// The name of the row; absent: what the predictions call themselves.
     pub system: Option<String>,
     /// Motion embeddings of a model that is not part of this program (TMR): an npz with `predicted` and `truth`, `[clips, 256]`.
@@ -46,6 +50,7 @@ impl Default for EvaluateSettings {
             },
             predictions_data: None,
             truth_data: String::new(),
+            split: "test".to_owned(),
             system: None,
             embeddings: None,
         }
@@ -73,12 +78,20 @@ impl Op for Evaluate {
     }
 
     fn inputs(&self) -> &'static [Port] {
-        &[Port {
-            name: "predictions",
-            kinds: &[ArtifactKind::Predictions],
-            arity: Arity::Optional,
-            about: "what a model says about the clips; or name a data set in `predictions_data`",
-        }]
+        &[
+            Port {
+                name: "predictions",
+                kinds: &[ArtifactKind::Predictions],
+                arity: Arity::Optional,
+                about: "what a model says about the clips; or name a data set in `predictions_data`",
+            },
+            Port {
+                name: "clips",
+                kinds: &[ArtifactKind::Clips],
+                arity: Arity::Optional,
+                about: "the true clips; or name a data set in `truth_data`",
+            },
+        ]
     }
 
     fn output(&self) -> ArtifactKind {
@@ -126,10 +139,14 @@ impl Op for Evaluate {
                 .help("name a stage in `predictions`, or a data set in `predictions_data`"),
             );
         }
-        if settings.truth_data.is_empty() {
+        if inputs.one("clips").is_some() != settings.truth_data.is_empty() {
             problems.push(
-                Problem::new(Code::E0204, "truth_data", "the true clips are not named")
-                    .help("name a data set of `data.yaml`: a folder of npz files"),
+                Problem::new(
+                    Code::E0206,
+                    "clips",
+                    "an evaluation has one source of true clips",
+                )
+                .help("name a stage in `clips`, or a data set of `data.yaml` in `truth_data`"),
             );
         }
         match settings.suite.settings.columns() {
@@ -151,7 +168,6 @@ impl Op for Evaluate {
         settings: &EvaluateSettings,
         context: &mut dyn StageContext,
     ) -> Result<Value, StageError> {
-        let truth = open(data_root(context, &settings.truth_data)?)?;
         let predictions = match (
             &settings.predictions_data,
             context.inputs("predictions").first(),
@@ -170,12 +186,25 @@ impl Op for Evaluate {
             .system
             .clone()
             .unwrap_or_else(|| predictions.index.system.clone());
-        let folders = Folders::new(truth, predictions);
+        let pairs: Box<dyn Pairs> = if let Some(clips) = context.inputs("clips").first() {
+                let root = clips.path.join(&settings.split);
+                let truth = ClipSet::open(&root).map_err(StageError::other)?;
+                let stored = Stored::new(truth, predictions).map_err(|id| {
+                    input(
+                        &format!("clip `{id}` was predicted but is not among the true clips"),
+                        "predict the split that `split` names",
+                    )
+                })?;
+                Box::new(stored)
+            } else {
+                let truth = open(data_root(context, &settings.truth_data)?)?;
+                Box::new(Folders::new(truth, predictions))
+            };
         let outcome = evaluate(
             &settings.suite.name,
             &settings.suite.settings,
             &system,
-            &folders,
+            pairs.as_ref(),
             embeddings.as_ref(),
             &mut |done, total| {
                 context.progress(done as u64, total as u64, "clips");

@@ -4,6 +4,7 @@ mod clip_signals;
 pub mod clips;
 mod evaluate;
 mod kinds;
+mod predict;
 mod table;
 pub mod tokenize;
 pub mod tokenizer_entry;

@@ -24,6 +24,7 @@ mod language_ops;
 mod rules;
 mod run;
 mod tensorboard;
+mod tokenizer_ops;
 mod view;
 mod vq_structure;
 mod world;

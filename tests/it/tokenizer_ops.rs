@@ -1,0 +1,166 @@
+//! `op: train_tokenizer` and `op: tokenize` as an experiment runs them: from clips of the built-in world to token shards.
+
+use reviv::experiment::catalog::Catalog;
+use reviv::experiment::load::{Request, load};
+use reviv::mget::{MgetSpec, ModalitySpec, Positions, Size};
+use reviv::run::execute::{Job, cache_of, execute};
+use reviv::run::{Interrupt, Progress, State};
+use reviv::training::{Shards, TokenSource};
+use serde_json::Value;
+use std::path::{Path, PathBuf};
+
+const EXPERIMENT: &str = "
+experiment: tokens_of_a_tiny_world
+about: Three tiny tokenizers.
+stages:
+  clips:
+    op: clips
+    source: {use: world_small, world: {size: 16, rooms: 3}}
+    train: 24
+    validation: 6
+  tok_camera:
+    op: train_tokenizer
+    clips: clips
+    modality: camera
+    tokenizer: {use: vq_temporal_small, codebook: 16, width: 16, depth: 1, heads: 2}
+    steps: 60
+    warmup: 5
+    checkpoint_every: 20
+  tok_left_hand:
+    op: train_tokenizer
+    clips: clips
+    modality: left_hand
+    tokenizer: {use: vq_kinematic_small, codebook: 16, width: 16, depth: 1, heads: 2}
+    steps: 4
+    batch: 4
+    warmup: 0
+  tok_rgb:
+    op: train_tokenizer
+    clips: clips
+    modality: rgb
+    tokenizer: {use: video_tiny, channels: 4}
+    steps: 3
+    batch: 2
+    warmup: 0
+  tokens:
+    op: tokenize
+    clips: clips
+    tokenizers: [tok_camera, tok_left_hand, tok_rgb]
+    pixels: rgb
+";
+
+/// Runs the experiment; gives every artifact by its op and modality.
+fn run(folder: &Path) -> Vec<(String, PathBuf, Value)> {
+    let file = folder.join("tiny.yaml");
+    std::fs::write(&file, EXPERIMENT).unwrap();
+    let request = Request {
+        path: file,
+        ..Request::default()
+    };
+    let (experiment, report) = load(&Catalog::linked(), &request);
+    let experiment = experiment.unwrap_or_else(|| panic!("{}", report.render(false)));
+    let runs = folder.join("runs");
+    let outcome = execute(&Job {
+        experiment: &experiment,
+        runs: &runs,
+        only: None,
+        shard: "1/1".parse().unwrap(),
+        progress: &Progress::silent(),
+        interrupt: &Interrupt::default(),
+    })
+    .unwrap();
+    let failures: Vec<String> = outcome.failures.iter().map(ToString::to_string).collect();
+    assert_eq!(outcome.state, State::Done, "{failures:?}");
+    let mut artifacts = Vec::new();
+    for leaf in cache_of(&runs).entries().unwrap() {
+        let Ok(text) = std::fs::read_to_string(leaf.path.join("manifest.json")) else {
+            continue;
+        };
+        let manifest: Value = serde_json::from_str(&text).unwrap();
+        let contents = manifest["contents"].clone();
+        let op = manifest["recipe"]["op"].as_str().unwrap_or_default();
+        let modality = contents["modality"].as_str().unwrap_or_default();
+        artifacts.push((format!("{op} {modality}"), leaf.path, contents));
+    }
+    artifacts
+}
+
+#[test]
+fn clips_become_tokens_that_the_model_reads_and_the_tokenizer_decodes() {
+    let folder = tempfile::tempdir().unwrap();
+    let artifacts = run(folder.path());
+    let of = |name: &str| {
+        artifacts
+            .iter()
+            .find(|(found, _, _)| found.trim() == name)
+            .unwrap_or_else(|| panic!("{name}: {artifacts:?}"))
+    };
+
+    let (_, path, contents) = of("train_tokenizer camera");
+    let scores = &contents["scores"];
+    let error = |kind: &str| scores[kind]["position_mm"].as_f64().unwrap();
+    assert!(
+        error("reconstruction") < error("mean"),
+        "{} against {}",
+        error("reconstruction"),
+        error("mean")
+    );
+    assert!(error("kmeans") > 0.0 && scores["usage"].as_f64().unwrap() > 0.0);
+    let page = std::fs::read_to_string(path.join("report/tokenizer.md")).unwrap();
+    assert!(
+        page.contains("position error, mm") && page.contains("perplexity"),
+        "{page}"
+    );
+    let hand = &of("train_tokenizer left_hand").2;
+    assert!(
+        hand["scores"]["reconstruction"]["mpjpe_mm"]
+            .as_f64()
+            .unwrap()
+            > 0.0
+    );
+    let video = &of("train_tokenizer rgb").2;
+    assert!(
+        video["scores"]["reconstruction"]["psnr_db"]
+            .as_f64()
+            .unwrap()
+            > 0.0
+    );
+
+    let (_, tokens, contents) = of("tokenize");
+    assert_eq!(
+        contents["tokens"]["camera"]["grid"],
+        serde_json::json!([30])
+    );
+    assert_eq!(contents["pixels"], serde_json::json!([16, 16, 16, 3]));
+    let spec = MgetSpec {
+        size: Size::default(),
+        positions: Positions::Released,
+        modalities: vec![
+            ModalitySpec::tokens("camera", &[30], 16),
+            ModalitySpec::tokens("left_hand", &[30, 7], 16),
+            ModalitySpec::pixels("pixels", [16, 16, 16, 3], [4, 8, 8]),
+            ModalitySpec::tokens("rgb", &[5, 2, 2], 200),
+        ],
+    };
+    let mut hands = 0;
+    for (split, clips) in [("train", 24), ("validation", 6)] {
+        let shards = Shards::open(&tokens.join(split), "tiny", &spec).unwrap();
+        assert_eq!(shards.len(), clips);
+        for index in 0..clips {
+            let sample = shards.read(index).unwrap();
+            assert_eq!(sample.tokens["camera"].ids.len(), 30);
+            assert_eq!(sample.tokens["rgb"].ids.len(), 20);
+            assert_eq!(sample.pixels["pixels"].len(), 16 * 16 * 16 * 3);
+            hands += usize::from(sample.tokens.contains_key("left_hand"));
+        }
+    }
+    assert!(hands > 0, "no clip shows the left hand");
+
+    let shards = Shards::open(&tokens.join("validation"), "tiny", &spec).unwrap();
+    let grid = shards.read(0).unwrap().tokens["camera"].clone();
+    for place in [path.clone(), tokens.join("tokenizers/camera")] {
+        let tokenizer = reviv::tokenizer::open(&place).unwrap();
+        let signals = tokenizer.decode(std::slice::from_ref(&grid)).unwrap();
+        assert_eq!(signals[0].values.shape(), [60, 9]);
+    }
+}
