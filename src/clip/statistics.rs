@@ -71,6 +71,20 @@ impl SignalStatistics {
         }
     }
 
+    /// Adds the statistics of other clips; in the order of the clips, the same numbers come out whatever was counted apart.
+    pub fn merge(&mut self, other: &Self) {
+        self.clips += other.clips;
+        self.without += other.without;
+        self.samples += other.samples;
+        self.valid += other.valid;
+        for (index, channel) in other.channels.iter().enumerate() {
+            match self.channels.get_mut(index) {
+                Some(own) => own.merge(channel),
+                None => self.channels.push(channel.clone()),
+            }
+        }
+    }
+
     /// The share of samples that are valid, in 0..=1.
     pub fn valid_share(&self) -> f64 {
         self.valid as f64 / (self.samples.max(1)) as f64
@@ -88,6 +102,27 @@ impl ChannelStatistics {
         self.squares += before * (value - self.mean);
         self.min = self.min.min(value);
         self.max = self.max.max(value);
+    }
+
+    /// Chan's combination of two counts.
+    fn merge(&mut self, other: &Self) {
+        if other.count == 0 {
+            return;
+        }
+        if self.count == 0 {
+            let unit = std::mem::take(&mut self.unit);
+            *self = other.clone();
+            self.unit = unit;
+            return;
+        }
+        let (a, b) = (self.count as f64, other.count as f64);
+        let apart = other.mean - self.mean;
+        self.count += other.count;
+        self.mean += apart * b / (a + b);
+        self.squares += other.squares + apart * apart * a * b / (a + b);
+        self.std = (self.squares / (a + b)).sqrt();
+        self.min = self.min.min(other.min);
+        self.max = self.max.max(other.max);
     }
 }
 
@@ -119,6 +154,25 @@ mod tests {
         );
         assert_eq!((y.count, y.mean, y.std), (1, 10.0, 0.0));
         assert_eq!(y.unit, "m");
+    }
+
+    #[test]
+    fn clips_counted_apart_add_up_to_clips_counted_together() {
+        let part = |from: u16, to: u16| Signal {
+            values: ArrayD::from_shape_fn(IxDyn(&[usize::from(to - from), 1]), |i| {
+                (f32::from(from) + i[0] as f32).sin() * 5.0
+            }),
+            valid: None,
+        };
+        let [mut whole, mut first, mut second] = [(); 3].map(|()| SignalStatistics::default());
+        whole.add(Some(&part(0, 100)), &["m".into()]);
+        first.add(Some(&part(0, 30)), &["m".into()]);
+        second.add(Some(&part(30, 100)), &["m".into()]);
+        first.merge(&second);
+        let (a, b) = (&whole.channels[0], &first.channels[0]);
+        assert_eq!((a.count, a.min, a.max), (b.count, b.min, b.max));
+        assert!((a.mean - b.mean).abs() < 1e-12 && (a.std - b.std).abs() < 1e-12);
+        assert_eq!(b.unit, "m");
     }
 
     #[test]

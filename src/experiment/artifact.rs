@@ -23,7 +23,7 @@ pub enum ArtifactKind {
     Predictions,
     /// Metrics per clip.
     Scores,
-    /// A table of scores.
+    /// A table: of scores, of statistics.
     Table,
     /// Files for other programs.
     Export,

@@ -1,12 +1,13 @@
 //! Modalities: what a signal is, and how it comes out of a [`Clip`] (Sec. 3, 4.2).
 //!
 //! [`built_in`] gives the seven of the paper at the sizes of a [`ClipFormat`]; [`declared`] makes one from a YAML entry.
-//! Read [`camera`] first, it is the most interesting conversion.
+//! Read [`camera`] first, it is the most interesting conversion. [`inventory`] counts what clips hold.
 
 pub mod camera;
 pub mod declared;
 pub mod format;
 pub mod gaze;
+pub mod inventory;
 pub mod joints;
 pub mod video;
 

@@ -187,19 +187,19 @@ impl Op for Evaluate {
             .clone()
             .unwrap_or_else(|| predictions.index.system.clone());
         let pairs: Box<dyn Pairs> = if let Some(clips) = context.inputs("clips").first() {
-                let root = clips.path.join(&settings.split);
-                let truth = ClipSet::open(&root).map_err(StageError::other)?;
-                let stored = Stored::new(truth, predictions).map_err(|id| {
-                    input(
-                        &format!("clip `{id}` was predicted but is not among the true clips"),
-                        "predict the split that `split` names",
-                    )
-                })?;
-                Box::new(stored)
-            } else {
-                let truth = open(data_root(context, &settings.truth_data)?)?;
-                Box::new(Folders::new(truth, predictions))
-            };
+            let root = clips.path.join(&settings.split);
+            let truth = ClipSet::open(&root).map_err(StageError::other)?;
+            let stored = Stored::new(truth, predictions).map_err(|id| {
+                input(
+                    &format!("clip `{id}` was predicted but is not among the true clips"),
+                    "predict the split that `split` names",
+                )
+            })?;
+            Box::new(stored)
+        } else {
+            let truth = open(data_root(context, &settings.truth_data)?)?;
+            Box::new(Folders::new(truth, predictions))
+        };
         let outcome = evaluate(
             &settings.suite.name,
             &settings.suite.settings,

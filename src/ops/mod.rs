@@ -5,6 +5,7 @@ pub mod clips;
 mod evaluate;
 mod kinds;
 mod predict;
+mod statistics;
 mod table;
 pub mod tokenize;
 pub mod tokenizer_entry;

@@ -13,6 +13,7 @@ mod recordings_golden;
 mod recordings_video;
 mod schema;
 mod shared;
+mod statistics;
 mod train_mget;
 mod training;
 mod trajectories;
