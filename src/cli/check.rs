@@ -26,7 +26,7 @@ impl super::Run for Check {
         let mut failed = false;
         let mut records = Vec::new();
         for file in &self.files {
-            let (experiment, report) = load::check(&catalog, &self.changes.request(file));
+            let (experiment, report) = load::check(&catalog, &self.changes.look(file));
             failed |= report.failed();
             if self.json {
                 records.push(json!({

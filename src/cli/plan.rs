@@ -4,7 +4,9 @@ use super::request::{Changes, count, open};
 use super::terminal::{Failure, Terminal};
 use crate::experiment::catalog::Catalog;
 use crate::experiment::plan::{Plan as Planned, PlannedStage, plan};
+use crate::run::inputs::Fingerprints;
 use crate::run::{Cache, Key};
+use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
@@ -26,10 +28,22 @@ pub struct Plan {
 impl super::Run for Plan {
     fn run(self, terminal: &Terminal) -> Result<(), Failure> {
         let catalog = Catalog::linked();
-        let (experiment, _) = open(&catalog, &self.changes.request(&self.file), terminal)?;
+        let (experiment, _) = open(&catalog, &self.changes.look(&self.file), terminal)?;
         let cache = Cache::new(self.runs.join("cache"));
         let cached = |key: &crate::experiment::ArtifactKey| cache.contains(&Key::from(*key));
-        let planned = plan(&experiment, &cached, &mut hash_file).map_err(Failure::machine)?;
+        let mut outside = Outside {
+            prints: Fingerprints::remembered(&cache),
+            unread: BTreeMap::new(),
+        };
+        let planned =
+            plan(&experiment, &cached, &mut |path| outside.hash(path)).map_err(Failure::machine)?;
+        for (path, number) in &outside.unread {
+            terminal.note(format_args!(
+                "note: `{}` has {} that were never hashed: `reviv run` does that; what is cached of it is not known here\n",
+                path.display(),
+                bytes(*number)
+            ));
+        }
         if self.json {
             terminal.json(&planned);
         } else {
@@ -39,10 +53,30 @@ impl super::Run for Plan {
     }
 }
 
-fn hash_file(path: &Path) -> std::io::Result<blake3::Hash> {
-    let mut hasher = blake3::Hasher::new();
-    hasher.update_reader(std::fs::File::open(path)?)?;
-    Ok(hasher.finalize())
+/// A plan is to come at once: it reads no more than this of outside files and data sets.
+const QUICK_BYTES: u64 = 64 << 20;
+
+/// Files and data sets that stages read.
+struct Outside<'a> {
+    prints: Fingerprints<'a>,
+    unread: BTreeMap<PathBuf, u64>,
+}
+
+impl Outside<'_> {
+    /// Of what is too large to read now, a stand-in that no artifact was ever made from.
+    fn hash(&mut self, path: &Path) -> std::io::Result<blake3::Hash> {
+        let print = self.prints.quickly(path, QUICK_BYTES);
+        match print.map_err(std::io::Error::other)? {
+            Ok(print) => Ok(print.hash),
+            Err(unread) => {
+                self.unread.insert(path.to_owned(), unread);
+                let mut hasher = blake3::Hasher::new();
+                hasher.update(b"reviv unread ");
+                hasher.update(path.to_string_lossy().as_bytes());
+                Ok(hasher.finalize())
+            }
+        }
+    }
 }
 
 fn render(plan: &Planned) -> String {

@@ -19,12 +19,21 @@ pub struct Changes {
 }
 
 impl Changes {
-    /// The request for a file with these changes.
+    /// The request for a file with these changes, to run it.
     pub fn request(&self, file: &std::path::Path) -> Request {
         Request {
             path: PathBuf::from(file),
             set: self.set.clone(),
             seed: self.seed,
+            data_may_be_absent: false,
+        }
+    }
+
+    /// The request for a file with these changes, only to look at it: data sets may be elsewhere.
+    pub fn look(&self, file: &std::path::Path) -> Request {
+        Request {
+            data_may_be_absent: true,
+            ..self.request(file)
         }
     }
 }

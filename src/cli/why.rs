@@ -26,7 +26,7 @@ pub struct Why {
 impl super::Run for Why {
     fn run(self, terminal: &Terminal) -> Result<(), Failure> {
         let catalog = Catalog::linked();
-        let (experiment, _) = open(&catalog, &self.changes.request(&self.file), terminal)?;
+        let (experiment, _) = open(&catalog, &self.changes.look(&self.file), terminal)?;
         let answers = why::explain(&catalog, &experiment, self.arm.as_deref(), &self.key)
             .map_err(|(message, help)| Failure::input(message, help))?;
         if self.json {

@@ -2,7 +2,7 @@
 
 use super::artifact::{ArtifactKind, Description};
 use super::source::Sources;
-use super::stage::{AnyOp, FileInput, InputFacts, Inputs, StagePlan};
+use super::stage::{AnyOp, DataInput, FileInput, InputFacts, Inputs, StagePlan};
 use super::typed::Trace;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -71,6 +71,8 @@ pub struct Stage {
     pub edges: Vec<Edge>,
     /// Files outside the experiment that it reads.
     pub files: Vec<FileInput>,
+    /// Data sets that it reads.
+    pub data: Vec<DataInput>,
     /// What its artifact will be.
     pub description: Description,
     /// Where each value was written, and what it replaced: key path relative to the stage (`tokenizer.codebook`) to
@@ -126,11 +128,12 @@ impl Graph {
 
     /// The artifact key of every stage, in order.
     ///
-    /// A key is the blake3 hash of (op, version, settings, seed where the op is seeded, hashes of files, input keys).
-    /// Names of stages, of files and of the experiment are not part of it: the same work is done once.
+    /// A key is the blake3 hash of (op, version, settings, seed where the op is seeded, hashes of files and data sets, input
+    /// keys). Names of stages, of files and of the experiment are not part of it: the same work is done once. Where a data
+    /// set is not on this machine, keys only say what stages share.
     ///
     /// # Errors
-    /// When `hash_file` cannot read a file.
+    /// When `hash_file` cannot read a file or a folder.
     pub fn keys(
         &self,
         hash_file: &mut dyn FnMut(&Path) -> std::io::Result<blake3::Hash>,
@@ -156,6 +159,14 @@ impl Graph {
                 part(hash_file(&file.path)?.as_bytes());
                 if let Some(value) = at_mut(&mut settings, &file.key) {
                     *value = Value::Null;
+                }
+            }
+            for data in &stage.data {
+                part(b"data");
+                part(data.key.as_bytes());
+                match &data.path {
+                    Some(path) => part(hash_file(path)?.as_bytes()),
+                    None => part(&[]),
                 }
             }
             part(canonical(&settings).as_bytes());

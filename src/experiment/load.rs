@@ -25,6 +25,8 @@ pub struct Request {
     pub set: Vec<String>,
     /// `--seed`: the seed of an experiment; for a sweep, the only one.
     pub seed: Option<u64>,
+    /// For who only checks, plans or reads: a data set that is not on this machine is a warning.
+    pub data_may_be_absent: bool,
 }
 
 /// Loads an experiment and checks everything that can be checked without compute.
@@ -154,12 +156,8 @@ fn build(
                 .help("give it another name"),
         );
     }
-    for name in catalog.twice() {
-        diagnostics.push(Diagnostic::new(
-            Code::E0205,
-            plan.name_span,
-            format!("two ops named `{name}` are linked into this binary"),
-        ));
+    for clash in catalog.clashes() {
+        diagnostics.push(Diagnostic::new(Code::E0205, plan.name_span, clash));
     }
     let data = data::roots(&request.path, environment, sources, diagnostics);
     let mut resolver = Resolver {
@@ -169,6 +167,7 @@ fn build(
         diagnostics,
         data: &data,
         environment,
+        data_may_be_absent: request.data_may_be_absent,
         imports: BTreeMap::new(),
         importing: vec![canonical(&request.path)],
     };

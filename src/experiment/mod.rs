@@ -18,6 +18,7 @@ mod interpolate;
 pub mod load;
 pub mod merge;
 mod names;
+mod outside;
 pub mod path;
 pub mod plan;
 pub mod problem;
@@ -40,5 +41,5 @@ pub use names::{nearest, suggest};
 pub use path::FilePath;
 pub use problem::{Code, Problem};
 pub use stage::{
-    AnyOp, Arity, FileInput, InputFacts, Inputs, Op, OpEntry, Port, StagePlan, TokenPlan,
+    AnyOp, Arity, DataInput, FileInput, InputFacts, Inputs, Op, OpEntry, Port, StagePlan, TokenPlan,
 };

@@ -44,12 +44,14 @@ pub enum Code {
     E0601,
     /// W0701: allowed, and probably not what was meant.
     W0701,
+    /// W0702: a data set is not on this machine; the experiment can be planned here, not run.
+    W0702,
 }
 
 impl Code {
     /// Warnings do not fail a check.
     pub const fn is_warning(self) -> bool {
-        matches!(self, Self::W0701)
+        matches!(self, Self::W0701 | Self::W0702)
     }
 }
 

@@ -9,6 +9,7 @@ use super::graph::{Compare, Edge, Graph, Stage};
 use super::interpolate::interpolate;
 use super::load::canonical;
 use super::names;
+use super::outside;
 use super::problem::{Code, Problem};
 use super::registry::Registry;
 use super::source::{Origin, Sources};
@@ -31,6 +32,8 @@ pub struct Resolver<'a> {
     pub diagnostics: &'a mut Vec<Diagnostic>,
     pub data: &'a BTreeMap<String, DataRoot>,
     pub environment: &'a BTreeMap<String, String>,
+    /// See [`super::load::Request`].
+    pub data_may_be_absent: bool,
     /// Experiments whose stages are read; `None` where one is broken.
     pub imports: BTreeMap<PathBuf, Option<Graph>>,
     /// Files that are being resolved: each reads stages of the next.
@@ -643,6 +646,7 @@ impl Resolver<'_> {
             name: draft.name,
             op: draft.op,
             files: draft.op.files(&settings),
+            data: outside::data(draft.op.data(&settings), self.data),
             settings,
             seed: draft.seed,
             edges,
@@ -652,44 +656,17 @@ impl Resolver<'_> {
         let before = self.diagnostics.len();
         let place = |key: &str| place(key, &stage.traces, draft.span);
         for file in &stage.files {
-            if !file.path.exists() {
-                self.diagnostics.push(
-                    Diagnostic::new(
-                        Code::E0601,
-                        place(&file.key),
-                        format!("there is no file `{}`", file.path.display()),
-                    )
-                    .label("not found")
-                    .help("relative paths start at the file they are written in"),
-                );
-            }
+            self.diagnostics
+                .extend(outside::missing_file(file, place(&file.key)));
         }
-        for (name, key) in draft.op.data(&stage.settings) {
-            let variable = format!("REVIV_DATA_{}", name.to_ascii_uppercase());
-            match self.data.get(&name) {
-                Some(root) if root.path.is_dir() => {}
-                Some(root) => self.diagnostics.push(
-                    Diagnostic::new(
-                        Code::E0601,
-                        place(&key),
-                        format!(
-                            "data set `{name}`: there is no folder `{}`",
-                            root.path.display()
-                        ),
-                    )
-                    .note(format!("{} says it lies there", root.set_by)),
-                ),
-                None => self.diagnostics.push(
-                    Diagnostic::new(
-                        Code::E0601,
-                        place(&key),
-                        format!("data set `{name}`: nothing says where it lies"),
-                    )
-                    .help(format!(
-                        "set `{variable}=FOLDER`, or write `{name}: FOLDER` into data.yaml"
-                    )),
-                ),
-            }
+        for data in &stage.data {
+            let root = self.data.get(&data.name);
+            self.diagnostics.extend(outside::missing_data(
+                data,
+                root,
+                self.data_may_be_absent,
+                place(&data.key),
+            ));
         }
         let mut problems: Vec<Problem> = Vec::new();
         let description = {

@@ -81,6 +81,17 @@ pub struct FileInput {
     pub path: PathBuf,
 }
 
+/// A data set that a stage reads; the bytes of its files are part of the stage's identity, where it lies is not.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct DataInput {
+    /// Its name in `data.yaml`.
+    pub name: String,
+    /// The settings key that names it, for the diagnostic.
+    pub key: String,
+    /// The folder; `None` where an experiment is only checked and planned, and the data is elsewhere.
+    pub path: Option<PathBuf>,
+}
+
 /// What a stage will be, without making it. Everything is optional; what is not known stays out.
 #[derive(Debug, Clone, Default, PartialEq, Serialize)]
 pub struct StagePlan {

@@ -5,6 +5,7 @@
 
 use super::cache::{Cache, Entry, Key};
 use super::error::RunError;
+use super::inputs::Fingerprints;
 use super::interrupt::Interrupt;
 use super::progress::{Progress, duration};
 use super::record::{Owned, RunDirectory, Shard, State};
@@ -47,8 +48,9 @@ pub fn cache_of(runs: &Path) -> Cache {
 
 /// Runs an experiment. An error means that the run could not be begun; what fails later is in the [`Outcome`].
 pub fn execute(job: &Job<'_>) -> Result<Outcome, RunError> {
-    let schedule = Schedule::of(job.experiment)?;
     let cache = cache_of(job.runs);
+    let prints = Fingerprints::remembered(&cache).watched(job.progress, job.interrupt);
+    let schedule = Schedule::of(job.experiment, prints)?;
     let targets = schedule.targets(job.only, job.shard)?;
     let asked = job.experiment.path.display().to_string();
     let run = RunDirectory::find_or_create(

@@ -75,7 +75,7 @@ pub struct PortPlan {
 /// An outside file or data set as it was when the run was planned.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct FilePlan {
-    /// The settings key that names it.
+    /// The settings key that names it; `data:NAME` for a data set.
     pub key: String,
     pub path: PathBuf,
     pub blake3: String,
@@ -83,9 +83,8 @@ pub struct FilePlan {
 }
 
 impl Schedule {
-    /// Lays out the work of a checked experiment. Reads every outside file once, to hash it.
-    pub fn of(experiment: &Experiment) -> Result<Self, RunError> {
-        let mut prints = Fingerprints::default();
+    /// Lays out the work of a checked experiment, with the fingerprints of the outside files and data sets that it reads.
+    pub fn of(experiment: &Experiment, mut prints: Fingerprints<'_>) -> Result<Self, RunError> {
         let mut cells = Vec::new();
         let mut works: Vec<Work> = Vec::new();
         let mut places: BTreeMap<Key, usize> = BTreeMap::new();
@@ -241,18 +240,26 @@ fn work(
     key: Key,
     keys: &[Key],
     label: &str,
-    prints: &Fingerprints,
+    prints: &Fingerprints<'_>,
 ) -> Work {
     let from = |index: &usize| (graph.stages[*index].name.clone(), keys[*index]);
     let inputs = stage.edges.iter().map(|edge| PortPlan {
         port: edge.port.to_owned(),
         from: edge.from.iter().map(from).collect(),
     });
-    let files = stage.files.iter().map(|file| {
-        let print = prints.known(&file.path);
+    let files = stage
+        .files
+        .iter()
+        .map(|file| (file.key.clone(), &file.path));
+    let data = stage.data.iter().filter_map(|data| {
+        let path = data.path.as_ref()?;
+        Some((format!("data:{}", data.name), path))
+    });
+    let files = files.chain(data).map(|(key, path)| {
+        let print = prints.known(path);
         FilePlan {
-            key: file.key.clone(),
-            path: file.path.clone(),
+            key,
+            path: path.clone(),
             blake3: print.map_or_else(String::new, |print| print.hash.to_hex().to_string()),
             bytes: print.map_or(0, |print| print.bytes),
         }
@@ -270,17 +277,12 @@ fn work(
         settings: stage.settings.clone(),
         inputs: inputs.collect(),
         files: files.collect(),
-        data: stage
-            .op
-            .data(&stage.settings)
-            .into_iter()
-            .map(|(name, _)| name)
-            .collect(),
+        data: stage.data.iter().map(|data| data.name.clone()).collect(),
         plan: serde_json::to_value(graph.plan(stage)).unwrap_or(Value::Null),
     }
 }
 
-fn keys(graph: &Graph, prints: &mut Fingerprints) -> Result<Vec<Key>, RunError> {
+fn keys(graph: &Graph, prints: &mut Fingerprints<'_>) -> Result<Vec<Key>, RunError> {
     let mut failed = None;
     let keys = graph.keys(&mut |path| {
         prints.of(path).map(|print| print.hash).map_err(|error| {

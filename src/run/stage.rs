@@ -5,6 +5,7 @@ use super::context::{Context, explain, panic_text};
 use super::environment;
 use super::error::{Failure, RunError};
 use super::files;
+use super::inputs::Fingerprints;
 use super::interrupt::Interrupt;
 use super::metrics::Metrics;
 use super::progress::Progress;
@@ -121,6 +122,7 @@ pub fn make(
     let (seconds, result) = perform(work, label, directory, output, around);
     record.seconds += seconds;
     let result = result.and_then(|contents| {
+        unchanged(work, around.cache)?;
         let made = Made {
             op: work.op.clone(),
             seconds: record.seconds,
@@ -149,6 +151,20 @@ pub fn make(
         // The first error is the cause; that its record could not be written follows from it.
         (Err(error), _) => Err(error),
     }
+}
+
+/// What was hashed before the work must be what the work has read.
+fn unchanged(work: &Work, cache: &Cache) -> Result<(), RunError> {
+    let mut prints = Fingerprints::remembered(cache);
+    for file in &work.files {
+        if prints.of(&file.path)?.hash.to_hex().as_str() != file.blake3 {
+            return Err(RunError::Changed {
+                what: format!("`{}`", file.path.display()),
+                detail: format!("it became another while `{}` was made from it", work.stage),
+            });
+        }
+    }
+    Ok(())
 }
 
 /// Does one piece of work again, in a scratch directory with `checkpoints/` to start from, and gives the directory of what

@@ -10,12 +10,12 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct TrainingSettings {
-    /// Optimizer steps; or give `epochs` or `tokens` instead.
+    /// Optimizer steps; or give `epochs` or `total_tokens` instead.
     pub steps: Option<u64>,
     /// Length in passes over the clips.
     pub epochs: Option<f64>,
     /// Length in nominal tokens: visible plus target budget of every sample, used or not.
-    pub tokens: Option<f64>,
+    pub total_tokens: Option<f64>,
     /// Samples per optimizer step, over all micro-batches.
     #[schemars(range(min = 1))]
     pub batch: usize,
@@ -52,7 +52,7 @@ impl Default for TrainingSettings {
         Self {
             steps: None,
             epochs: None,
-            tokens: None,
+            total_tokens: None,
             batch: 16,
             micro_batch: 0,
             learning_rate: 1e-3,
@@ -94,7 +94,7 @@ pub struct Measure {
 /// Why training settings cannot be used.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum SettingsError {
-    #[error("give exactly one of `steps`, `epochs` and `tokens`")]
+    #[error("give exactly one of `steps`, `epochs` and `total_tokens`")]
     Length,
     #[error("`{0}` must be a positive, finite number")]
     Positive(&'static str),
@@ -108,7 +108,7 @@ impl TrainingSettings {
     /// # Errors
     /// When the length is given twice or not at all, or is not positive.
     pub fn total_steps(&self, measure: Measure) -> Result<u64, SettingsError> {
-        let span = match (self.steps, self.epochs, self.tokens) {
+        let span = match (self.steps, self.epochs, self.total_tokens) {
             (Some(steps), None, None) => Span::Steps(steps),
             (None, Some(epochs), None) => Span::Epochs(epochs),
             (None, None, Some(tokens)) => Span::Tokens(tokens),
@@ -117,7 +117,7 @@ impl TrainingSettings {
         let name = match span {
             Span::Steps(_) => "steps",
             Span::Epochs(_) => "epochs",
-            Span::Tokens(_) => "tokens",
+            Span::Tokens(_) => "total_tokens",
         };
         match self.steps_of(span, measure) {
             Some(steps) if steps > 0 => Ok(steps),

@@ -1,7 +1,10 @@
 //! The language: layers, references, substitutions, sweeps.
 
-use crate::language_ops::{Folder, TINY};
+use crate::language_ops::{Folder, TINY, catalog};
+use reviv::experiment::load::{Request, load_in};
+use reviv::experiment::plan::plan;
 use serde_json::json;
+use std::collections::BTreeMap;
 
 #[test]
 fn an_experiment_becomes_a_graph_with_every_default_filled_in() {
@@ -351,4 +354,27 @@ fn data_sets_lie_where_data_yaml_or_the_environment_says() {
     let elsewhere = folder.path("elsewhere").display().to_string();
     let (experiment, _) = folder.load_with("a.yaml", &[], &[("REVIV_DATA_ADT", &elsewhere)]);
     assert_eq!(experiment.unwrap().data["adt"], folder.path("elsewhere"));
+}
+
+#[test]
+fn an_experiment_can_be_planned_where_its_data_is_not() {
+    let folder = Folder::new(&[("a.yaml", &TINY.replace("train: 20", "source: recorded"))]);
+    let request = Request {
+        path: folder.path("a.yaml"),
+        data_may_be_absent: true,
+        ..Request::default()
+    };
+    let (experiment, report) = load_in(&catalog(), &request, &BTreeMap::new());
+    let said: Vec<String> = report
+        .diagnostics
+        .iter()
+        .map(|d| format!("{}: {}", d.code, d.message))
+        .collect();
+    assert_eq!(said, ["W0702: data set `adt`: nothing says where it lies"]);
+    let experiment = experiment.unwrap();
+    let hash = &mut |_: &std::path::Path| Err(std::io::ErrorKind::NotFound.into());
+    let planned = plan(&experiment, &|_| false, hash).unwrap();
+    assert_eq!(planned.stages.len(), 5);
+    // To run it, the data must be there.
+    assert!(folder.says("a.yaml", &[]).contains("error[E0601]"));
 }

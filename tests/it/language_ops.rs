@@ -422,7 +422,7 @@ impl Folder {
         let request = Request {
             path: self.path(name),
             set: set.iter().map(|&text| text.to_owned()).collect(),
-            seed: None,
+            ..Request::default()
         };
         let environment = environment
             .iter()

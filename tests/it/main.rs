@@ -22,6 +22,7 @@ mod vrs_writer;
 mod kill;
 mod language;
 mod language_ops;
+mod plugins;
 mod rules;
 mod run;
 mod tensorboard;

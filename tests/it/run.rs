@@ -1,11 +1,12 @@
 //! Runs as the library executes them, with two small ops of the tests' own: what is cached, redone, resumed, refused.
 
 use reviv::experiment::{
-    Arity, ArtifactKind, Cell, Description, Edge, Experiment, Graph, Inputs, Op, OpEntry, Port,
-    Problem, Stage, StageContext, StageError,
+    Arity, ArtifactKind, Cell, DataInput, Description, Edge, Experiment, Graph, Inputs, Op,
+    OpEntry, Port, Problem, Stage, StageContext, StageError,
 };
 use reviv::run::execute::{Job, Outcome, cache_of, execute};
 use reviv::run::record::RunDirectory;
+use reviv::run::verify::{Check, Redo, Verdict};
 use reviv::run::{Cache, Interrupt, Progress, RunError, Shard, State, checkpoint, files, metrics};
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
@@ -22,6 +23,8 @@ struct NumbersSettings {
     stop_at: Option<u64>,
     /// `input`, `panic`, `full_disk`, `full_checkpoint`: fails in this way.
     fail: Option<String>,
+    /// A file that it writes to although it only reads it.
+    touch: Option<String>,
 }
 
 impl Op for Numbers {
@@ -100,6 +103,9 @@ impl Op for Numbers {
             if context.interrupted() || (settings.stop_at == Some(step) && !resumed) {
                 return Err(StageError::Interrupted);
             }
+        }
+        if let Some(path) = &settings.touch {
+            std::fs::write(path, "changed").map_err(StageError::io(Path::new(path)))?;
         }
         let path = context.output().join("numbers.json");
         let text = serde_json::to_string(&numbers).map_err(StageError::other)?;
@@ -182,6 +188,7 @@ fn stage(
         seed,
         edges,
         files: Vec::new(),
+        data: Vec::new(),
         description: Description::default(),
         traces: BTreeMap::new(),
     }
@@ -289,6 +296,75 @@ fn changing_one_setting_redoes_only_what_depends_on_it() {
         dir.path(),
     );
     assert_eq!((longer.made, longer.found), (2, 0));
+}
+
+#[test]
+fn a_data_set_is_its_bytes_wherever_it_lies() {
+    let dir = tempfile::tempdir().unwrap();
+    let asked = |folder: &str| {
+        let mut asked = experiment(vec![cell("", 0, json!({"steps": 5}), 1.0)]);
+        asked.cells[0].graph.stages[0].data = vec![DataInput {
+            name: "adt".into(),
+            key: "source".into(),
+            path: Some(dir.path().join(folder)),
+        }];
+        asked
+    };
+    let runs = dir.path().join("runs");
+    for folder in ["here", "there"] {
+        std::fs::create_dir(dir.path().join(folder)).unwrap();
+        std::fs::write(dir.path().join(folder).join("a.csv"), "1").unwrap();
+    }
+    let first = run(&asked("here"), &runs);
+    assert_eq!((first.state, first.made), (State::Done, 2));
+    let manifest = cache_of(&runs);
+    let prints: Vec<_> = manifest
+        .entries()
+        .unwrap()
+        .iter()
+        .filter_map(|leaf| match manifest.look(&leaf.key) {
+            reviv::run::cache::Entry::Whole(manifest) => Some(manifest.recipe.files),
+            _ => None,
+        })
+        .filter(|files| !files.is_empty())
+        .collect();
+    assert!(prints.iter().any(|files| files.contains_key("data:adt")));
+    assert_eq!(run(&asked("there"), &runs).made, 0);
+    // One byte of it, and everything that was made from it is another.
+    std::fs::write(dir.path().join("there/a.csv"), "2").unwrap();
+    assert_eq!(run(&asked("there"), &runs).made, 2);
+    assert_eq!(run(&asked("here"), &runs).made, 0);
+    std::fs::write(dir.path().join("here/b.csv"), "").unwrap();
+    assert_eq!(run(&asked("here"), &runs).made, 2);
+    let checks = verify(&first.run);
+    assert!(
+        checks
+            .iter()
+            .any(|c| c.what.starts_with("input") && c.verdict == Verdict::Changed)
+    );
+}
+
+fn verify(run: &RunDirectory) -> Vec<Check> {
+    let (progress, interrupt) = (Progress::silent(), Interrupt::default());
+    reviv::run::verify::verify(run, Redo::Nothing, &progress, &interrupt).unwrap()
+}
+
+#[test]
+fn a_data_set_that_changes_under_the_work_spoils_it() {
+    let dir = tempfile::tempdir().unwrap();
+    let data = dir.path().join("data");
+    std::fs::create_dir(&data).unwrap();
+    std::fs::write(data.join("a.csv"), "1").unwrap();
+    let touch = data.join("a.csv").display().to_string();
+    let mut asked = experiment(vec![cell("", 0, json!({"steps": 5, "touch": touch}), 1.0)]);
+    asked.cells[0].graph.stages[0].data = vec![DataInput {
+        name: "adt".into(),
+        key: "source".into(),
+        path: Some(data),
+    }];
+    let outcome = run(&asked, &dir.path().join("runs"));
+    assert_eq!((outcome.state, outcome.made), (State::Failed, 0));
+    assert_eq!(outcome.failures[0].code(), "E0602");
 }
 
 #[test]

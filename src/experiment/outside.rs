@@ -1,0 +1,77 @@
+//! What lies outside an experiment and is read by it: files that settings name, and data sets that `data.yaml` names.
+
+use super::data::DataRoot;
+use super::diagnostic::{Diagnostic, Span};
+use super::problem::Code;
+use super::stage::{DataInput, FileInput};
+use std::collections::BTreeMap;
+
+/// The data sets of a stage with the folders they lie in; none where nothing says so, or where no folder is.
+pub fn data(asked: Vec<(String, String)>, roots: &BTreeMap<String, DataRoot>) -> Vec<DataInput> {
+    let found = |(name, key): (String, String)| {
+        let root = roots.get(&name).filter(|root| root.path.is_dir());
+        DataInput {
+            path: root.map(|root| root.path.clone()),
+            name,
+            key,
+        }
+    };
+    asked.into_iter().map(found).collect()
+}
+
+/// Says that a file is not there.
+pub fn missing_file(file: &FileInput, span: Span) -> Option<Diagnostic> {
+    if file.path.exists() {
+        return None;
+    }
+    let message = format!("there is no file `{}`", file.path.display());
+    Some(
+        Diagnostic::new(Code::E0601, span, message)
+            .label("not found")
+            .help("relative paths start at the file they are written in"),
+    )
+}
+
+/// Says that a data set is not here: an error for who wants to run, a note for who only checks and plans.
+pub fn missing_data(
+    data: &DataInput,
+    root: Option<&DataRoot>,
+    may_be_absent: bool,
+    span: Span,
+) -> Option<Diagnostic> {
+    if data.path.is_some() {
+        return None;
+    }
+    let name = &data.name;
+    let code = if may_be_absent {
+        Code::W0702
+    } else {
+        Code::E0601
+    };
+    let diagnostic = match root {
+        Some(root) => Diagnostic::new(
+            code,
+            span,
+            format!(
+                "data set `{name}`: there is no folder `{}`",
+                root.path.display()
+            ),
+        )
+        .note(format!("{} says it lies there", root.set_by)),
+        None => Diagnostic::new(
+            code,
+            span,
+            format!("data set `{name}`: nothing says where it lies"),
+        )
+        .help(format!(
+            "set `REVIV_DATA_{}=FOLDER`, or write `{name}: FOLDER` into data.yaml",
+            name.to_ascii_uppercase()
+        )),
+    };
+    Some(if may_be_absent {
+        diagnostic
+            .note("the experiment can be checked and planned here, and runs where the data is")
+    } else {
+        diagnostic
+    })
+}
