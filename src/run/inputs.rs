@@ -198,7 +198,8 @@ impl Look {
                 let path = folder.join(&name);
                 let below = match name.to_str() {
                     Some(name) => format!("{prefix}{name}"),
-                    None => format!("{prefix}{name:?}"),
+                    // No text: its bytes under another name.
+                    None => format!("{prefix}{}", blake3::hash(name.as_encoded_bytes())),
                 };
                 let found = match std::fs::metadata(&path) {
                     Err(_) if path.is_symlink() => Found::Other("leads nowhere".into()),
@@ -309,7 +310,7 @@ impl Look {
             some.par_iter_mut().try_for_each(|(path, stamp, hash)| {
                 let (read, bytes) = files::hash(path)?;
                 // What was listed and what was read must be one file.
-                let after = Stamp::of(&std::fs::metadata(&*path).at("reading", path)?);
+                let after = Stamp::of(&std::fs::metadata(*path).at("reading", path)?);
                 if after != *stamp || bytes != stamp.bytes {
                     return Err(RunError::Changed {
                         what: format!("`{}`", path.display()),

@@ -12,7 +12,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 
-/// As a plug-in crate does it: this test program is one.
+// As a plug-in crate does it: this test program is one.
 inventory::submit! {
     LinkedEntry {
         origin: "wrist_watch 0.1",
