@@ -1,17 +1,20 @@
 //! Iterative parallel decoding (Supp. C): given any tokens, generate any others.
 //!
 //! Read in this order: [`settings`] (a registry entry), [`schedule`] (tokens and temperature per step), [`plan`] (which target
-//! when, from what), [`model`] (what a model must answer), [`filter`] (logits to a token), [`mod@generate`] (**the loop**), [`mget`] (the model).
+//! when, from what), [`model`] (what a model must answer), [`filter`] (logits to a token), [`mod@generate`] (**the loop**), [`mget`] (the model), [`reconstructor`] (a model folder
+//! with its tokenizers as one function from clips to clips).
 
 pub mod filter;
 pub mod generate;
 pub mod mget;
 pub mod model;
 pub mod plan;
+pub mod reconstructor;
 pub mod schedule;
 pub mod settings;
 
 pub use generate::{Generated, GeneratedTokens, generate};
 pub use mget::MgetTokens;
 pub use model::{DecodingError, Sample, Slot, TokenModality, TokenModel};
+pub use reconstructor::{Reconstructed, Reconstructor, ReconstructorError, Wish};
 pub use settings::DecodingSettings;

@@ -5,6 +5,7 @@ pub mod clips;
 mod evaluate;
 mod kinds;
 mod predict;
+mod reconstruct;
 mod statistics;
 mod table;
 pub mod tokenize;

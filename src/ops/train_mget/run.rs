@@ -1,10 +1,12 @@
 //! Running `op: train_mget`: what arrives, the loop, what leaves.
 
 use super::{TrainMgetSettings, measure, spec};
+use crate::decoding::reconstructor::{Binding, TOKENIZERS};
 use crate::engine::{Compute, Initialise};
 use crate::experiment::{Code, InputArtifact, StageContext, StageError, TokenFacts};
 use crate::masking::{Masking, PIXELS};
 use crate::mget::Mget;
+use crate::modality::ClipFormat;
 use crate::run::checkpoint;
 use crate::run::environment::Stopwatch;
 use crate::training::{
@@ -49,6 +51,8 @@ pub(super) struct Run {
     settings: TrainingSettings,
     masking: Masking,
     tokenizers: Option<std::path::PathBuf>,
+    /// The sizes of the clips the tokens were made of, where the tokens say it.
+    clips: Option<ClipFormat>,
 }
 
 impl Run {
@@ -118,7 +122,8 @@ impl Run {
             trainer.resume(&path).map_err(StageError::other)?;
             context.log(&format!("continues from step {step}"));
         }
-        let tokenizers = Some(first.path.join("tokenizers")).filter(|path| path.is_dir());
+        let clips = serde_json::from_value(first.contents["format"].clone()).ok();
+        let tokenizers = Some(first.path.join(TOKENIZERS)).filter(|path| path.is_dir());
         Ok(Self {
             trainer,
             feed: Arc::new(Feed {
@@ -135,6 +140,7 @@ impl Run {
             settings: training.clone(),
             masking,
             tokenizers,
+            clips,
         })
     }
 
@@ -270,7 +276,11 @@ impl Run {
         let path = output.join(VALIDATION);
         std::fs::write(&path, format!("{validation:#}\n")).map_err(StageError::io(&path))?;
         if let Some(tokenizers) = &self.tokenizers {
-            copy(tokenizers, &output.join("tokenizers"))?;
+            copy(tokenizers, &output.join(TOKENIZERS))?;
+        }
+        if let Some(clips) = self.clips {
+            let binding = Binding::of(&output, clips).map_err(StageError::other)?;
+            binding.write(&output).map_err(StageError::other)?;
         }
         Ok(json!({
             "mget": self.feed.spec,

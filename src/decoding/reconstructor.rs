@@ -1,0 +1,424 @@
+//! A model folder as one function: clips in, the signals they lack out (Sec. 4.1).
+//!
+//! A model folder holds MGET (`mget.json`, `weights.safetensors`), the tokenizers it was trained on
+//! (`tokenizers/<modality>/`), and [`FILE`], which says what clips it takes and names the tokenizers by their bytes, so that a
+//! model and tokenizers that do not belong together are found before anything is decoded into nonsense.
+
+use super::{
+    DecodingError, DecodingSettings, GeneratedTokens, MgetTokens, Sample, Slot, generate,
+};
+use crate::clip::{Clip, Signal};
+use crate::engine::Compute;
+use crate::masking::PIXELS;
+use crate::mget::{Content, Mget, ModalitySpec};
+use crate::modality::{self, ClipFormat, Modality};
+use crate::tokenizer::{self, TokenGrid, Tokenizer, TokenizerError};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+/// The file in a model folder that binds its parts together.
+pub const FILE: &str = "model.json";
+/// The folder of tokenizers in a model folder.
+pub const TOKENIZERS: &str = "tokenizers";
+
+/// What [`FILE`] holds.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Binding {
+    /// The sizes of the clips the model was trained on.
+    pub clips: ClipFormat,
+    /// blake3 of the files of every tokenizer, by modality.
+    pub tokenizers: BTreeMap<String, String>,
+}
+
+/// Why a model folder cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum ReconstructorError {
+    #[error("{path}: {error}")]
+    Io {
+        path: PathBuf,
+        error: std::io::Error,
+    },
+    #[error("{}: no model folder: {reason}", path.display())]
+    NotAModel { path: PathBuf, reason: String },
+    #[error(
+        "{}: the tokenizer of `{modality}` is not the one the model was trained on (expected {expected}, found {found})",
+        path.display()
+    )]
+    OtherTokenizer {
+        path: PathBuf,
+        modality: String,
+        expected: String,
+        found: String,
+    },
+    #[error("the tokenizer of `{modality}` has {found} tokens a clip of {vocabulary} kinds, the model expects {expected}")]
+    OtherGrid {
+        modality: String,
+        found: String,
+        vocabulary: usize,
+        expected: String,
+    },
+    #[error("no modality `{name}` in this model; it has: {known}")]
+    UnknownModality { name: String, known: String },
+    #[error("clip `{clip}` has no {modality}, which the model is to be given")]
+    NotGiven { clip: String, modality: String },
+    #[error("clip `{clip}`: {reason}")]
+    Clip { clip: String, reason: String },
+    #[error(transparent)]
+    Tokenizer(#[from] TokenizerError),
+    #[error(transparent)]
+    Decoding(#[from] DecodingError),
+}
+
+impl Binding {
+    /// Binds the tokenizers that lie in `folder` to the clips that their model was trained on.
+    ///
+    /// # Errors
+    /// When a file cannot be read.
+    pub fn of(folder: &Path, clips: ClipFormat) -> Result<Self, ReconstructorError> {
+        let root = folder.join(TOKENIZERS);
+        let mut tokenizers = BTreeMap::new();
+        for path in entries(&root)? {
+            if let Some(name) = path.file_name().and_then(|name| name.to_str())
+                && path.is_dir()
+            {
+                tokenizers.insert(name.to_owned(), digest(&path)?);
+            }
+        }
+        Ok(Self { clips, tokenizers })
+    }
+
+    /// Writes [`FILE`] into `folder`.
+    ///
+    /// # Errors
+    /// When it cannot be written.
+    pub fn write(&self, folder: &Path) -> Result<(), ReconstructorError> {
+        let path = folder.join(FILE);
+        let text = serde_json::to_string_pretty(self).map_err(|error| not_a_model(folder, error))?;
+        std::fs::write(&path, text + "\n").map_err(|error| ReconstructorError::Io { path, error })
+    }
+
+    /// Reads [`FILE`] of `folder`.
+    ///
+    /// # Errors
+    /// When it is not there or not of this form.
+    pub fn read(folder: &Path) -> Result<Self, ReconstructorError> {
+        let text = std::fs::read_to_string(folder.join(FILE))
+            .map_err(|error| not_a_model(folder, format_args!("`{FILE}`: {error}")))?;
+        serde_json::from_str(&text)
+            .map_err(|error| not_a_model(folder, format_args!("`{FILE}`: {error}")))
+    }
+}
+
+fn not_a_model(path: &Path, reason: impl std::fmt::Display) -> ReconstructorError {
+    ReconstructorError::NotAModel {
+        path: path.to_owned(),
+        reason: reason.to_string(),
+    }
+}
+
+/// What lies in a folder, by name; nothing where there is no folder.
+fn entries(folder: &Path) -> Result<Vec<PathBuf>, ReconstructorError> {
+    let wrong = |error| ReconstructorError::Io {
+        path: folder.to_owned(),
+        error,
+    };
+    if !folder.is_dir() {
+        return Ok(Vec::new());
+    }
+    let mut paths = std::fs::read_dir(folder)
+        .map_err(wrong)?
+        .map(|entry| Ok(entry?.path()))
+        .collect::<Result<Vec<_>, std::io::Error>>()
+        .map_err(wrong)?;
+    paths.sort();
+    Ok(paths)
+}
+
+/// The hash of names and bytes of the files of a folder.
+fn digest(folder: &Path) -> Result<String, ReconstructorError> {
+    let mut hasher = blake3::Hasher::new();
+    for path in entries(folder)?.into_iter().filter(|path| path.is_file()) {
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        hasher.update(&(name.len() as u64).to_le_bytes());
+        hasher.update(name.as_bytes());
+        let wrong = |error| ReconstructorError::Io {
+            path: path.clone(),
+            error,
+        };
+        let file = std::fs::File::open(&path).map_err(wrong)?;
+        hasher.update(&file.metadata().map_err(wrong)?.len().to_le_bytes());
+        hasher.update_reader(file).map_err(wrong)?;
+    }
+    Ok(hasher.finalize().to_hex()[..32].to_owned())
+}
+
+/// A model with its tokenizers.
+pub struct Reconstructor {
+    model: Mget,
+    format: ClipFormat,
+    modalities: BTreeMap<String, Box<dyn Modality>>,
+    tokenizers: BTreeMap<String, Box<dyn Tokenizer>>,
+}
+
+/// What to generate, and how.
+#[derive(Debug, Clone)]
+pub struct Wish<'a> {
+    /// Modalities that every clip has and the model sees.
+    pub given: &'a [String],
+    /// Modalities to generate.
+    pub wanted: &'a [String],
+    pub decoding: &'a DecodingSettings,
+    pub seed: u64,
+}
+
+/// What the model sees of a batch of clips.
+#[derive(Default)]
+struct Seen<'a> {
+    tokens: BTreeMap<&'a str, Vec<TokenGrid>>,
+    pixels: Vec<Vec<f32>>,
+}
+
+/// A generated clip.
+#[derive(Debug, Clone)]
+pub struct Reconstructed {
+    /// Holds the wanted modalities and nothing else.
+    pub clip: Clip,
+    /// Per modality and sample, 0 (a guess) to 1 (certain), from the entropies of the tokens. Not an accuracy.
+    pub confidence: BTreeMap<String, Vec<f32>>,
+}
+
+impl Reconstructor {
+    /// Opens a model folder and checks that its parts belong together.
+    ///
+    /// # Errors
+    /// When a part is missing, damaged, or another one than the model was trained on.
+    pub fn open(folder: &Path, compute: &Compute) -> Result<Self, ReconstructorError> {
+        let binding = Binding::read(folder)?;
+        let model = Mget::open(folder, compute).map_err(|error| not_a_model(folder, error))?;
+        let modalities: BTreeMap<String, Box<dyn Modality>> = modality::all(&binding.clips)
+            .into_iter()
+            .map(|modality| (modality.name().to_owned(), modality))
+            .collect();
+        let mut tokenizers = BTreeMap::new();
+        for slot in &model.spec().modalities {
+            let name = &slot.name;
+            if name == PIXELS {
+                continue;
+            }
+            let path = folder.join(TOKENIZERS).join(name);
+            let expected = binding.tokenizers.get(name).ok_or_else(|| {
+                not_a_model(folder, format_args!("`{FILE}` names no tokenizer of `{name}`"))
+            })?;
+            if !path.is_dir() {
+                return Err(not_a_model(
+                    folder,
+                    format_args!("the tokenizer of `{name}` is missing"),
+                ));
+            }
+            let found = digest(&path)?;
+            if *expected != found {
+                return Err(ReconstructorError::OtherTokenizer {
+                    path,
+                    modality: name.clone(),
+                    expected: expected.clone(),
+                    found,
+                });
+            }
+            let tokenizer = tokenizer::open(&path)?;
+            let count: usize = tokenizer.grid().iter().product();
+            if count != slot.count() {
+                return Err(ReconstructorError::OtherGrid {
+                    modality: name.clone(),
+                    found: count.to_string(),
+                    vocabulary: tokenizer.vocabulary(),
+                    expected: slot.count().to_string(),
+                });
+            }
+            tokenizers.insert(name.clone(), tokenizer);
+        }
+        Ok(Self {
+            model,
+            format: binding.clips,
+            modalities,
+            tokenizers,
+        })
+    }
+
+    /// The sizes of the clips the model takes.
+    pub fn format(&self) -> &ClipFormat {
+        &self.format
+    }
+
+    /// The modalities it knows, raw video aside.
+    pub fn names(&self) -> impl Iterator<Item = &str> {
+        self.tokenizers.keys().map(String::as_str)
+    }
+
+    /// One of its modalities.
+    ///
+    /// # Errors
+    /// When it has none of this name.
+    pub fn modality(&self, name: &str) -> Result<&dyn Modality, ReconstructorError> {
+        match self.modalities.get(name) {
+            Some(modality) if self.tokenizers.contains_key(name) => Ok(modality.as_ref()),
+            _ => Err(ReconstructorError::UnknownModality {
+                name: name.to_owned(),
+                known: self.names().collect::<Vec<_>>().join(", "),
+            }),
+        }
+    }
+
+    /// Generates what is wanted for a batch of clips. `ids` name their random numbers: a clip's result does not depend on the
+    /// others of its batch.
+    ///
+    /// # Errors
+    /// When a modality is unknown, a clip lacks a given one, or a signal has another form than the model was trained on.
+    pub fn reconstruct(
+        &self,
+        clips: &[Clip],
+        ids: &[u64],
+        wish: &Wish<'_>,
+    ) -> Result<Vec<Reconstructed>, ReconstructorError> {
+        let seen = self.see(clips, wish.given)?;
+        let samples: Vec<Sample<'_>> = ids
+            .iter()
+            .enumerate()
+            .map(|(clip, &id)| Sample {
+                id,
+                slots: self.slots(&seen, clip),
+            })
+            .collect();
+        let targets: Vec<&str> = wish.wanted.iter().map(String::as_str).collect();
+        let generated = generate(
+            &MgetTokens::new(&self.model),
+            wish.decoding,
+            &samples,
+            &targets,
+            wish.seed,
+        )?;
+        let mut made: Vec<Reconstructed> = clips
+            .iter()
+            .map(|clip| Reconstructed {
+                clip: Clip::empty(clip.id.clone(), clip.source.clone()),
+                confidence: BTreeMap::new(),
+            })
+            .collect();
+        for name in wish.wanted {
+            let modality = self.modality(name)?;
+            let tokenizer = &self.tokenizers[name];
+            let own: Vec<&GeneratedTokens> = generated
+                .iter()
+                .filter_map(|g| g.targets.get(name))
+                .collect();
+            let grids: Vec<TokenGrid> = own
+                .iter()
+                .map(|tokens| TokenGrid {
+                    ids: tokens.ids.clone(),
+                    grid: tokenizer.grid().to_vec(),
+                })
+                .collect();
+            let signals = tokenizer.decode(&grids)?;
+            for ((one, signal), tokens) in made.iter_mut().zip(signals).zip(own) {
+                let steps = tokenizer.grid()[0];
+                let each = per_sample(&tokens.confidence, steps, signal.values.shape()[0]);
+                one.confidence.insert(name.clone(), each);
+                modality
+                    .insert(signal, &mut one.clip)
+                    .map_err(|error| wrong_clip(&one.clip, error))?;
+            }
+        }
+        Ok(made)
+    }
+
+    fn see<'a>(&self, clips: &[Clip], given: &'a [String]) -> Result<Seen<'a>, ReconstructorError> {
+        let mut seen = Seen::default();
+        for name in given {
+            let signals = self.signals(name, clips)?;
+            if name == "rgb" && self.model.spec().index(PIXELS).is_some() {
+                let floats = |signal: &Signal| signal.values.iter().copied().collect();
+                seen.pixels = signals.iter().map(floats).collect();
+            }
+            seen.tokens
+                .insert(name, self.tokenizers[name].encode(&signals)?);
+        }
+        Ok(seen)
+    }
+
+    /// One slot per modality of the model, for one clip.
+    fn slots<'a>(&self, seen: &'a Seen<'_>, clip: usize) -> Vec<Slot<'a>> {
+        let of = |slot: &ModalitySpec| match seen.tokens.get(slot.name.as_str()) {
+            Some(grids) => Slot::given(grids[clip].ids.clone()),
+            None if slot.name == PIXELS => Slot::Pixels(match seen.pixels.get(clip) {
+                Some(values) => Content::Floats(values),
+                None => Content::Absent,
+            }),
+            None => Slot::unknown(slot.count()),
+        };
+        self.model.spec().modalities.iter().map(of).collect()
+    }
+
+    fn signals(&self, name: &str, clips: &[Clip]) -> Result<Vec<Signal>, ReconstructorError> {
+        let modality = self.modality(name)?;
+        let of = |clip: &Clip| {
+            let signal = modality
+                .extract(clip)
+                .map_err(|error| wrong_clip(clip, error))?;
+            signal.ok_or_else(|| ReconstructorError::NotGiven {
+                clip: clip.id.clone(),
+                modality: name.to_owned(),
+            })
+        };
+        clips.iter().map(of).collect()
+    }
+}
+
+fn wrong_clip(clip: &Clip, reason: impl std::fmt::Display) -> ReconstructorError {
+    ReconstructorError::Clip {
+        clip: clip.id.clone(),
+        reason: reason.to_string(),
+    }
+}
+
+/// The mean confidence of the tokens of each of `steps` time steps, spread over `samples`.
+fn per_sample(tokens: &[f32], steps: usize, samples: usize) -> Vec<f32> {
+    let each = (tokens.len() / steps.max(1)).max(1);
+    let means: Vec<f32> = tokens
+        .chunks(each)
+        .map(|chunk| chunk.iter().sum::<f32>() / chunk.len() as f32)
+        .collect();
+    let of = |sample: usize| means.get(sample * steps / samples.max(1)).copied();
+    (0..samples)
+        .map(|sample| of(sample).unwrap_or(f32::NAN))
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn confidence_of_tokens_is_spread_over_samples() {
+        let tokens = [1.0, 0.0, 0.5, 0.5];
+        assert_eq!(per_sample(&tokens, 2, 6), [0.5, 0.5, 0.5, 0.5, 0.5, 0.5]);
+        assert_eq!(per_sample(&[0.25, 0.75], 2, 4), [0.25, 0.25, 0.75, 0.75]);
+    }
+
+    #[test]
+    fn a_folder_that_is_no_model_says_so() {
+        let folder = tempfile::tempdir().unwrap();
+        let error = Binding::read(folder.path()).unwrap_err().to_string();
+        assert!(error.contains("no model folder"), "{error}");
+    }
+
+    #[test]
+    fn another_tokenizer_has_another_digest() {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::write(folder.path().join("tokenizer.safetensors"), b"one").unwrap();
+        let one = digest(folder.path()).unwrap();
+        assert_eq!(one, digest(folder.path()).unwrap());
+        std::fs::write(folder.path().join("tokenizer.safetensors"), b"two").unwrap();
+        assert_ne!(one, digest(folder.path()).unwrap());
+    }
+}

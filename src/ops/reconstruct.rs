@@ -1,0 +1,244 @@
+//! `op: reconstruct`: one video of any length, or one stored clip, becomes a reconstruction folder (Sec. 4.1, Supp. C and D).
+//!
+//! The artifact is what [`crate::reconstruction::folder`] writes: arrays, exports, manifest and page.
+
+mod recording;
+mod run;
+
+use super::predict::artifact;
+use crate::decoding::DecodingSettings;
+use crate::experiment::{
+    Arity, ArtifactKind, Code, Description, Entry, FileInput, FilePath, Inputs, Op, OpEntry, Port,
+    Problem, StageContext, StageError, StagePlan,
+};
+use crate::reconstruction::lens::LensSettings;
+use crate::reconstruction::scale::FloorFit;
+use crate::reconstruction::windows::windows;
+use crate::source::video::VideoSettings;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+use serde_json::Value;
+use std::path::{Path, PathBuf};
+
+/// Settings of [`Reconstruct`].
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct ReconstructSettings {
+    /// The video, or a folder of pictures; absent: a clip of the stage in `clips`.
+    pub video: Option<FilePath>,
+    /// How the video is read.
+    pub reading: VideoSettings,
+    /// Seconds of the video that are left out at its start.
+    #[schemars(range(min = 0.0))]
+    pub start: f64,
+    /// At most so many seconds; absent: to the end.
+    #[schemars(range(min = 0.0))]
+    pub seconds: Option<f64>,
+    /// The split of the clip.
+    pub split: String,
+    /// The number of the clip.
+    pub clip: usize,
+    /// A model folder that no stage makes.
+    pub model_folder: Option<FilePath>,
+    /// What is generated; empty means everything but `rgb`.
+    pub wanted: Vec<String>,
+    /// How tokens are generated.
+    pub decoding: Entry<DecodingSettings>,
+    /// Seconds that neighbouring windows of two seconds have in common: 0.5, 1 or 1.5.
+    pub overlap: f64,
+    /// The camera, as far as it is known.
+    pub lens: LensSettings,
+    /// How depth becomes metric from the floor.
+    pub floor: FloorFit,
+    /// Metric depth of another model at the frames of the model's video, instead of the floor: npz, or a folder of EXR or
+    /// 16-bit PNG (millimetres).
+    pub anchor: Option<FilePath>,
+}
+
+impl Default for ReconstructSettings {
+    fn default() -> Self {
+        Self {
+            video: None,
+            reading: VideoSettings::default(),
+            start: 0.0,
+            seconds: None,
+            split: "test".to_owned(),
+            clip: 0,
+            model_folder: None,
+            wanted: Vec::new(),
+            decoding: Entry {
+                name: "fast".to_owned(),
+                settings: DecodingSettings::default(),
+            },
+            overlap: 1.0,
+            lens: LensSettings::default(),
+            floor: FloorFit::default(),
+            anchor: None,
+        }
+    }
+}
+
+/// The op.
+#[derive(Debug)]
+pub struct Reconstruct;
+inventory::submit! { OpEntry(&Reconstruct) }
+
+impl Op for Reconstruct {
+    type Settings = ReconstructSettings;
+
+    fn name(&self) -> &'static str {
+        "reconstruct"
+    }
+
+    fn version(&self) -> u32 {
+        1
+    }
+
+    fn about(&self) -> &'static str {
+        "Reconstructs the wearer and the world from one video: arrays, exports and a page."
+    }
+
+    fn inputs(&self) -> &'static [Port] {
+        &[
+            Port {
+                name: "model",
+                kinds: &[ArtifactKind::Mget],
+                arity: Arity::Optional,
+                about: "the model, with its tokenizers; or name a folder in `model_folder`",
+            },
+            Port {
+                name: "clips",
+                kinds: &[ArtifactKind::Clips],
+                arity: Arity::Optional,
+                about: "where the clip is, when there is no `video`; its truth is shown beside the prediction",
+            },
+        ]
+    }
+
+    fn output(&self) -> ArtifactKind {
+        ArtifactKind::Export
+    }
+
+    fn files(&self, settings: &ReconstructSettings) -> Vec<FileInput> {
+        let mut files: Vec<FileInput> = [("video", &settings.video), ("anchor", &settings.anchor)]
+            .into_iter()
+            .filter_map(|(key, path)| {
+                Some(FileInput {
+                    key: key.to_owned(),
+                    path: path.as_ref()?.0.clone().into(),
+                })
+            })
+            .collect();
+        if let Some(folder) = &settings.model_folder {
+            files.extend(model_files(folder.as_ref()).into_iter().map(|path| FileInput {
+                key: "model_folder".to_owned(),
+                path,
+            }));
+        }
+        files
+    }
+
+    fn check(
+        &self,
+        settings: &ReconstructSettings,
+        inputs: &Inputs<'_>,
+        problems: &mut Vec<Problem>,
+    ) -> Description {
+        let model = inputs.one("model");
+        match (model, &settings.model_folder) {
+            (None, None) => problems.push(
+                Problem::new(Code::E0301, "model", "no model")
+                    .help("name a stage in `model`, or a folder in `model_folder`"),
+            ),
+            (Some(_), Some(_)) => problems.push(
+                Problem::new(Code::E0301, "model_folder", "two models")
+                    .help("leave out `model` or `model_folder`"),
+            ),
+            _ => {}
+        }
+        let clips = inputs.one("clips");
+        match (clips, &settings.video) {
+            (None, None) => problems.push(
+                Problem::new(Code::E0301, "video", "nothing to reconstruct")
+                    .help("name a file in `video`, or a stage in `clips`"),
+            ),
+            (Some(_), Some(_)) => problems.push(
+                Problem::new(Code::E0301, "video", "a video and clips")
+                    .help("leave out `video` or `clips`"),
+            ),
+            _ => {}
+        }
+        if let Some(&count) = clips.and_then(|clips| clips.clips.get(&settings.split))
+            && settings.clip as u64 >= count
+        {
+            problems.push(Problem::new(
+                Code::E0202,
+                "clip",
+                format!("split `{}` has {count} clips", settings.split),
+            ));
+        }
+        if let Some(model) = model {
+            let known: Vec<&str> = model.tokens.keys().map(String::as_str).collect();
+            for (index, name) in settings.wanted.iter().enumerate() {
+                if !known.contains(&name.as_str()) {
+                    problems.push(
+                        Problem::new(
+                            Code::E0203,
+                            format!("wanted.{index}"),
+                            format!("the model has no modality `{name}`"),
+                        )
+                        .help(format!("it has: {}", known.join(", "))),
+                    );
+                }
+            }
+        }
+        if let Err(error) = windows(1.0, settings.overlap) {
+            problems.push(Problem::new(Code::E0202, "overlap", error.to_string()));
+        }
+        if let Err(error) = settings.lens.first_pose() {
+            problems.push(Problem::new(Code::E0202, "lens.up", error.to_string()));
+        }
+        Description::default()
+    }
+
+    fn plan(
+        &self,
+        _settings: &ReconstructSettings,
+        _inputs: &Inputs<'_>,
+        _seed: u64,
+    ) -> StagePlan {
+        StagePlan::default()
+    }
+
+    fn run(
+        &self,
+        settings: &ReconstructSettings,
+        context: &mut dyn StageContext,
+    ) -> Result<Value, StageError> {
+        let model = match &settings.model_folder {
+            Some(folder) => PathBuf::from(&folder.0),
+            None => artifact(context, "model")?.path.clone(),
+        };
+        run::run(settings, &model, context)
+    }
+}
+
+/// The files of a model folder; the folder itself where there are none, so that its absence is found.
+fn model_files(folder: &Path) -> Vec<PathBuf> {
+    let mut files = Vec::new();
+    let mut open = vec![folder.to_path_buf()];
+    while let Some(here) = open.pop() {
+        for entry in std::fs::read_dir(&here).into_iter().flatten().flatten() {
+            let path = entry.path();
+            match entry.file_type() {
+                Ok(kind) if kind.is_dir() => open.push(path),
+                _ => files.push(path),
+            }
+        }
+    }
+    files.sort();
+    if files.is_empty() {
+        files.push(folder.to_path_buf());
+    }
+    files
+}

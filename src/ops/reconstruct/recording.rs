@@ -1,0 +1,266 @@
+//! What is reconstructed: a video, or a stored clip with its truth.
+
+use super::ReconstructSettings;
+use crate::clip::store::ClipSet;
+use crate::clip::{Clip, Intrinsics, Rgb};
+use crate::experiment::{Code, InputArtifact, StageError};
+use crate::geometry::rigid::Rigid;
+use crate::modality::ClipFormat;
+use crate::reconstruction::lens::{LensError, LensSettings};
+use crate::reconstruction::windows::Window;
+use crate::source::SourceError;
+use crate::source::video::Video;
+use crate::view::Fact;
+use crate::view::scene::{Badge, Tone};
+use std::fmt::Display;
+
+/// Seconds of a clip.
+const CLIP_SECONDS: f64 = 2.0;
+
+/// An opened recording.
+pub(super) struct Recording {
+    pub title: String,
+    pub seconds: f64,
+    pub intrinsics: Intrinsics,
+    /// World pose of the first camera.
+    pub first: Rigid,
+    pub assumptions: Vec<Fact>,
+    pub badges: Vec<Badge>,
+    pub truth: Option<Clip>,
+    frames: Frames,
+}
+
+enum Frames {
+    Video { video: Video, start: f64 },
+    Clip(Rgb),
+}
+
+impl Recording {
+    /// Opens what the settings name.
+    pub fn open(
+        settings: &ReconstructSettings,
+        clips: Option<&InputArtifact>,
+        format: &ClipFormat,
+    ) -> Result<Self, StageError> {
+        match (&settings.video, clips) {
+            (Some(path), _) => {
+                let video =
+                    Video::open_with(path, &settings.reading).map_err(|error| unreadable(&error))?;
+                Self::video(settings, video, format)
+            }
+            (None, Some(artifact)) => Self::clip(settings, artifact, format),
+            (None, None) => Err(input("nothing to reconstruct", "name a file in `video`")),
+        }
+    }
+
+    fn video(
+        settings: &ReconstructSettings,
+        video: Video,
+        format: &ClipFormat,
+    ) -> Result<Self, StageError> {
+        let info = video.info().clone();
+        let left = info.seconds() - settings.start;
+        if info.frames == 0 || left <= 0.0 || !left.is_finite() {
+            return Err(input(
+                format_args!(
+                    "`{}` has {} frames, {:.2} s; nothing is left from {:.2} s on",
+                    video.path().display(),
+                    info.frames,
+                    info.seconds(),
+                    settings.start
+                ),
+                "choose a smaller `start`, or another video",
+            ));
+        }
+        let size = [info.width, info.height];
+        let intrinsics = settings
+            .lens
+            .intrinsics(size, format.size as u32)
+            .map_err(|error| lens(&error))?;
+        let square = info.width.min(info.height);
+        let mut assumptions = vec![
+            fact(
+                "Video",
+                format_args!(
+                    "{} x {}, {} frames, {:.2} s, by {}",
+                    info.width,
+                    info.height,
+                    info.frames,
+                    info.seconds(),
+                    info.decoder
+                ),
+            ),
+            fact(
+                "Frame rate",
+                format_args!(
+                    "{:.3} Hz from the file{}; the model sees {} frames in two seconds",
+                    info.fps,
+                    if info.variable_rate {
+                        ", which varies: frames are chosen by their times"
+                    } else {
+                        ""
+                    },
+                    format.frames
+                ),
+            ),
+            fact(
+                "Crop",
+                format_args!(
+                    "the centre {square} x {square}, resized to {0} x {0}",
+                    format.size
+                ),
+            ),
+        ];
+        if info.rotation != 0 {
+            assumptions.push(fact(
+                "Rotation",
+                format_args!("{} degrees, from the file", info.rotation),
+            ));
+        }
+        assumptions.extend(said(&settings.lens, &intrinsics));
+        Ok(Self {
+            title: video
+                .path()
+                .file_stem()
+                .map_or_else(|| "video".into(), |stem| stem.to_string_lossy().into_owned()),
+            seconds: settings.seconds.map_or(left, |limit| left.min(limit)),
+            intrinsics,
+            first: settings.lens.first_pose().map_err(|error| lens(&error))?,
+            assumptions,
+            badges: Vec::new(),
+            truth: None,
+            frames: Frames::Video {
+                video,
+                start: settings.start,
+            },
+        })
+    }
+
+    fn clip(
+        settings: &ReconstructSettings,
+        artifact: &InputArtifact,
+        format: &ClipFormat,
+    ) -> Result<Self, StageError> {
+        let root = artifact.path.join(&settings.split);
+        let clips = ClipSet::open(&root).map_err(StageError::other)?;
+        if settings.clip >= clips.len() {
+            return Err(input(
+                format_args!("split `{}` has {} clips", settings.split, clips.len()),
+                "choose a smaller `clip`",
+            ));
+        }
+        let mut clip = clips.clip(settings.clip).map_err(StageError::other)?;
+        let rgb = clip.rgb.take().ok_or_else(|| {
+            input(
+                format_args!("clip `{}` has no colour video", clip.id),
+                "choose another clip",
+            )
+        })?;
+        let mut lens_settings = settings.lens;
+        let camera = clip.camera.as_ref();
+        let known = camera.and_then(|camera| camera.intrinsics);
+        if let Some(camera) = camera
+            && let (Some(up), Some(pose)) = (camera.up_world, camera.T_world_camera.first())
+            && camera.valid.first() == Some(&true)
+        {
+            let up = pose.rotation.inverse() * up.into_inner();
+            lens_settings.up = Some([up.x, up.y, up.z]);
+        }
+        let size = format.size as u32;
+        let intrinsics = match known {
+            Some(known) => known,
+            None => lens_settings
+                .intrinsics([size, size], size)
+                .map_err(|error| lens(&error))?,
+        };
+        let mut assumptions = vec![fact("Clip", &clip.id)];
+        if known.is_some() {
+            assumptions.push(fact(
+                "Intrinsics",
+                format_args!("{}, from the clip", words(&intrinsics)),
+            ));
+            assumptions.push(fact("Up", "from the clip"));
+        } else {
+            assumptions.extend(said(&lens_settings, &intrinsics));
+        }
+        let mut badges = Vec::new();
+        if clip.source == "world" {
+            badges.push(Badge {
+                text: "synthetic".to_owned(),
+                tone: Tone::Plain,
+            });
+        }
+        Ok(Self {
+            title: clip.id.clone(),
+            seconds: CLIP_SECONDS,
+            intrinsics,
+            first: lens_settings.first_pose().map_err(|error| lens(&error))?,
+            assumptions,
+            badges,
+            truth: Some(clip),
+            frames: Frames::Clip(rgb),
+        })
+    }
+
+    /// The frames of a window, as the model takes them.
+    pub fn frames(&self, window: &Window, format: &ClipFormat) -> Result<Rgb, StageError> {
+        match &self.frames {
+            Frames::Clip(rgb) => Ok(rgb.clone()),
+            Frames::Video { video, start } => {
+                let first = video.schedule().nearest(start + window.start_seconds());
+                video
+                    .load_clip(first, format.video_rate, format.frames, format.size as u32)
+                    .map_err(|error| unreadable(&error))
+            }
+        }
+    }
+}
+
+fn fact(label: &str, value: impl Display) -> Fact {
+    Fact {
+        label: label.to_owned(),
+        value: value.to_string(),
+    }
+}
+
+fn words(lens: &Intrinsics) -> String {
+    format!(
+        "fx {:.2}, fy {:.2}, cx {:.2}, cy {:.2} at {} x {}",
+        lens.fx, lens.fy, lens.cx, lens.cy, lens.width, lens.height
+    )
+}
+
+/// What the settings say of the camera, and what is assumed instead.
+fn said(settings: &LensSettings, lens: &Intrinsics) -> Vec<Fact> {
+    let from = match settings.calibration {
+        Some(_) => "from `lens.calibration`".to_owned(),
+        None => format!(
+            "ASSUMED: {} degrees across the square (`lens.field_of_view`, `lens.calibration`)",
+            settings.field_of_view
+        ),
+    };
+    let up = match settings.up {
+        Some(_) => "from `lens.up`".to_owned(),
+        None => "ASSUMED: the first camera is level (`lens.up`)".to_owned(),
+    };
+    vec![
+        fact("Intrinsics", format_args!("{}, {from}", words(lens))),
+        fact("Up", up),
+    ]
+}
+
+pub(super) fn input(message: impl Display, help: &str) -> StageError {
+    StageError::Input {
+        code: Code::E0601,
+        message: message.to_string(),
+        help: help.to_owned(),
+    }
+}
+
+fn unreadable(error: &SourceError) -> StageError {
+    input(error, "check the file, or convert it with `ffmpeg`")
+}
+
+fn lens(error: &LensError) -> StageError {
+    input(error, "correct `lens`")
+}

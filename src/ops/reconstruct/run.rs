@@ -1,0 +1,141 @@
+//! The loop: window by window from frames to the folder.
+
+use super::ReconstructSettings;
+use super::recording::{Recording, input};
+use crate::clip::Clip;
+use crate::decoding::{Reconstructor, Wish};
+use crate::engine::Compute;
+use crate::experiment::{StageContext, StageError};
+use crate::ops::predict::refused;
+use crate::reconstruction::anchor;
+use crate::reconstruction::folder::{Folder, Setting};
+use crate::reconstruction::windows::{samples_of, windows};
+use crate::run::environment::Stopwatch;
+use crate::view::Fact;
+use serde_json::{Value, json};
+use std::collections::BTreeMap;
+use std::path::Path;
+
+/// Seconds by part of the work.
+#[derive(Debug, Default)]
+struct Times(BTreeMap<&'static str, f64>);
+
+impl Times {
+    fn take<T>(&mut self, part: &'static str, work: impl FnOnce() -> T) -> T {
+        let watch = Stopwatch::start();
+        let made = work();
+        *self.0.entry(part).or_default() += watch.seconds();
+        made
+    }
+
+    fn record(&self, context: &mut dyn StageContext, windows: usize) -> Result<(), StageError> {
+        let names: Vec<String> = self.0.keys().map(|part| format!("seconds/{part}")).collect();
+        let scalars: Vec<(&str, f64)> = names
+            .iter()
+            .map(String::as_str)
+            .zip(self.0.values().copied())
+            .collect();
+        context.record(windows as u64, &scalars)?;
+        let mut text = String::from("| part | seconds | per window |\n|---|---|---|\n");
+        for (part, seconds) in &self.0 {
+            let each = seconds / windows.max(1) as f64;
+            text += &format!("| {part} | {seconds:.2} | {each:.3} |\n");
+        }
+        context.record_text(windows as u64, "time", &text)
+    }
+}
+
+pub(super) fn run(
+    settings: &ReconstructSettings,
+    model: &Path,
+    context: &mut dyn StageContext,
+) -> Result<Value, StageError> {
+    let mut times = Times::default();
+    let reconstructor = times
+        .take("open the model", || Reconstructor::open(model, &Compute::cpu()))
+        .map_err(refused)?;
+    let format = reconstructor.format().clone();
+    let given = ["rgb".to_owned()];
+    let wanted: Vec<String> = if settings.wanted.is_empty() {
+        let others = reconstructor.names().filter(|name| *name != "rgb");
+        others.map(ToOwned::to_owned).collect()
+    } else {
+        settings.wanted.clone()
+    };
+    let clips = context.inputs("clips").first().cloned();
+    let recording = Recording::open(settings, clips.as_ref(), &format)?;
+    let list = windows(recording.seconds, settings.overlap)
+        .map_err(|error| input(error, "choose another `overlap`"))?;
+    let samples = samples_of(recording.seconds);
+    let rate = format.video_rate;
+    let frames = ((recording.seconds * rate - 1e-6).ceil() as usize).max(1);
+    let mut assumptions = recording.assumptions.clone();
+    assumptions.push(Fact {
+        label: "Decoding".into(),
+        value: format!(
+            "`{}`, seed {}, {} windows of 2 s, {} s in common",
+            settings.decoding.name,
+            context.seed(),
+            list.len(),
+            settings.overlap
+        ),
+    });
+    let anchor = settings
+        .anchor
+        .as_ref()
+        .map(|path| anchor::read(path.as_ref(), frames))
+        .transpose()
+        .map_err(|error| input(error, "see `anchor` in `reviv list`"))?;
+    let setting = Setting {
+        title: recording.title.clone(),
+        video_rate: rate,
+        frames,
+        samples,
+        intrinsics: recording.intrinsics,
+        first: recording.first,
+        floor_fit: settings.floor.clone(),
+        anchor,
+        assumptions,
+        badges: recording.badges.clone(),
+        truth: recording.truth.clone(),
+    };
+    let mut folder = Folder::new(context.output(), setting).map_err(StageError::other)?;
+    let wish = Wish {
+        given: &given,
+        wanted: &wanted,
+        decoding: &settings.decoding.settings,
+        seed: context.seed(),
+    };
+    for window in &list {
+        if context.interrupted() {
+            return Err(StageError::Interrupted);
+        }
+        let rgb = times.take("read the video", || recording.frames(window, &format))?;
+        let mut clip = Clip::empty(format!("{}/{:06}", recording.title, window.index), "video");
+        clip.rgb = Some(rgb.clone());
+        let made = times
+            .take("decode", || {
+                reconstructor.reconstruct(&[clip], &[window.index as u64], &wish)
+            })
+            .map_err(refused)?;
+        for one in made {
+            times
+                .take("stitch", || {
+                    folder.push(window, rgb.frames.view(), &one.clip, &one.confidence)
+                })
+                .map_err(StageError::other)?;
+        }
+        context.progress(window.index as u64 + 1, list.len() as u64, "windows");
+    }
+    let manifest = times
+        .take("write", || folder.finish())
+        .map_err(StageError::other)?;
+    times.record(context, list.len())?;
+    Ok(json!({
+        "seconds": recording.seconds,
+        "windows": list.len(),
+        "modalities": wanted,
+        "scale": manifest.scale,
+        "files": manifest.files,
+    }))
+}

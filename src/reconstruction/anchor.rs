@@ -1,0 +1,217 @@
+//! Metric depth of another model, to which relative depth is fitted (Supp. D).
+//!
+//! One map per frame of the model's video, in time order: an npz with one array `[T, H, W]` (or one named `depth`), or a folder
+//! of OpenEXR files (their `Z` or first channel, as ViPE writes them) or of 16-bit PNG in millimetres. What is zero, negative
+//! or not finite is unknown.
+
+use crate::formats::FormatError;
+use crate::formats::npz::Npz;
+use crate::source::image::grey16_from_png;
+use ndarray::{Array2, Array3, Axis};
+use std::path::{Path, PathBuf};
+
+/// Maps are this wide or high at most.
+const LARGEST: usize = 8192;
+
+/// Why an anchor cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum AnchorError {
+    #[error("{}: {error}", path.display())]
+    Io {
+        path: PathBuf,
+        error: std::io::Error,
+    },
+    #[error(transparent)]
+    Npz(#[from] FormatError),
+    #[error("{}: {reason}", path.display())]
+    Malformed { path: PathBuf, reason: String },
+    #[error("{}: {found} depth maps for {expected} frames of the model's video", path.display())]
+    Frames {
+        path: PathBuf,
+        expected: usize,
+        found: usize,
+    },
+}
+
+fn malformed(path: &Path, reason: impl std::fmt::Display) -> AnchorError {
+    AnchorError::Malformed {
+        path: path.to_owned(),
+        reason: reason.to_string(),
+    }
+}
+
+/// `[T, H, W]` metres for `frames` frames; NaN where unknown. More maps than frames are thinned evenly, as when the other model
+/// has seen the whole video.
+///
+/// # Errors
+/// When the files cannot be read, are of different sizes, or are fewer than the frames.
+pub fn read(path: &Path, frames: usize) -> Result<Array3<f32>, AnchorError> {
+    let mut maps = if path.is_dir() {
+        folder(path, frames)?
+    } else {
+        npz(path, frames)?
+    };
+    maps.mapv_inplace(|metres| {
+        if metres.is_finite() && metres > 0.0 {
+            metres
+        } else {
+            f32::NAN
+        }
+    });
+    Ok(maps)
+}
+
+/// Of `found` maps those nearest in time to `frames` frames that span the same time.
+fn chosen(path: &Path, found: usize, frames: usize) -> Result<Vec<usize>, AnchorError> {
+    if found < frames || frames == 0 {
+        return Err(AnchorError::Frames {
+            path: path.to_owned(),
+            expected: frames,
+            found,
+        });
+    }
+    Ok((0..frames).map(|frame| frame * found / frames).collect())
+}
+
+fn npz(path: &Path, frames: usize) -> Result<Array3<f32>, AnchorError> {
+    let file = Npz::read(path)?;
+    let names: Vec<&String> = file.arrays.keys().collect();
+    let name = match names.as_slice() {
+        [only] => (*only).clone(),
+        _ => "depth".to_owned(),
+    };
+    let array: Array3<f32> = file.get(&name)?.to_dim()?;
+    let keep = chosen(path, array.len_of(Axis(0)), frames)?;
+    Ok(array.select(Axis(0), &keep))
+}
+
+fn folder(path: &Path, frames: usize) -> Result<Array3<f32>, AnchorError> {
+    let entries = std::fs::read_dir(path).map_err(|error| AnchorError::Io {
+        path: path.to_owned(),
+        error,
+    })?;
+    let known = |file: &Path| matches!(extension(file).as_str(), "exr" | "png");
+    let mut files: Vec<PathBuf> = entries
+        .flatten()
+        .map(|entry| entry.path())
+        .filter(|file| known(file))
+        .collect();
+    files.sort();
+    if files.is_empty() {
+        return Err(malformed(path, "no .exr and no .png in this folder"));
+    }
+    let mut maps: Option<Array3<f32>> = None;
+    for (index, file) in chosen(path, files.len(), frames)?.into_iter().enumerate() {
+        let map = map(&files[file])?;
+        let (height, width) = map.dim();
+        let maps = maps.get_or_insert_with(|| Array3::from_elem((frames, height, width), f32::NAN));
+        if maps.shape()[1..] != [height, width] {
+            return Err(malformed(
+                &files[file],
+                format_args!("{width} x {height} pixels, the first has {:?}", &maps.shape()[1..]),
+            ));
+        }
+        maps.index_axis_mut(Axis(0), index).assign(&map);
+    }
+    maps.ok_or_else(|| malformed(path, "no depth map"))
+}
+
+fn extension(file: &Path) -> String {
+    file.extension()
+        .map_or_else(String::new, |e| e.to_string_lossy().to_lowercase())
+}
+
+fn map(file: &Path) -> Result<Array2<f32>, AnchorError> {
+    if extension(file) == "exr" {
+        return exr(file);
+    }
+    let bytes = std::fs::read(file).map_err(|error| AnchorError::Io {
+        path: file.to_owned(),
+        error,
+    })?;
+    let millimetres = grey16_from_png(&bytes).map_err(|reason| malformed(file, reason))?;
+    Ok(millimetres.mapv(|value| f32::from(value) / 1000.0))
+}
+
+fn exr(file: &Path) -> Result<Array2<f32>, AnchorError> {
+    use ::exr::prelude::{ReadChannels, ReadLayers, read};
+    let meta = ::exr::meta::MetaData::read_from_file(file, false)
+        .map_err(|error| malformed(file, error))?;
+    for header in &meta.headers {
+        let size = header.layer_size;
+        if size.width() > LARGEST || size.height() > LARGEST {
+            return Err(malformed(
+                file,
+                format_args!("{} x {} pixels", size.width(), size.height()),
+            ));
+        }
+    }
+    let image = read()
+        .no_deep_data()
+        .largest_resolution_level()
+        .all_channels()
+        .first_valid_layer()
+        .all_attributes()
+        .non_parallel()
+        .from_file(file)
+        .map_err(|error| malformed(file, error))?;
+    let layer = image.layer_data;
+    let channels = &layer.channel_data.list;
+    let channel = channels
+        .iter()
+        .find(|channel| channel.name.eq_case_insensitive("z"))
+        .or(channels.first())
+        .ok_or_else(|| malformed(file, "no channel"))?;
+    let values: Vec<f32> = channel.sample_data.values_as_f32().collect();
+    Array2::from_shape_vec((layer.size.height(), layer.size.width()), values)
+        .map_err(|error| malformed(file, error))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_sequence_of_pictures_is_metres_and_zero_is_unknown() {
+        let folder = tempfile::tempdir().unwrap();
+        for (index, value) in [1500_u16, 0].into_iter().enumerate() {
+            let file = std::fs::File::create(folder.path().join(format!("{index:03}.png"))).unwrap();
+            let mut encoder = png::Encoder::new(file, 2, 1);
+            encoder.set_color(png::ColorType::Grayscale);
+            encoder.set_depth(png::BitDepth::Sixteen);
+            let mut writer = encoder.write_header().unwrap();
+            let data: Vec<u8> = [value, value].iter().flat_map(|v| v.to_be_bytes()).collect();
+            writer.write_image_data(&data).unwrap();
+        }
+        let maps = read(folder.path(), 2).unwrap();
+        assert_eq!(maps[[0, 0, 1]], 1.5);
+        assert!(maps[[1, 0, 0]].is_nan());
+        assert!(matches!(
+            read(folder.path(), 3),
+            Err(AnchorError::Frames { found: 2, .. })
+        ));
+    }
+
+    #[test]
+    fn half_floats_of_open_exr_are_read() {
+        use ::exr::prelude::{AnyChannel, AnyChannels, Image, Layer, WritableImage, f16};
+        let folder = tempfile::tempdir().unwrap();
+        let values = vec![f16::from_f32(0.5), f16::from_f32(2.25)];
+        let channel = AnyChannel::new("Z", ::exr::prelude::FlatSamples::F16(values));
+        let layer = Layer::new(
+            (2, 1),
+            ::exr::prelude::LayerAttributes::named("depth"),
+            ::exr::prelude::Encoding::SMALL_LOSSLESS,
+            AnyChannels::sort([channel].into_iter().collect()),
+        );
+        let path = folder.path().join("000.exr");
+        Image::from_layer(layer).write().to_file(&path).unwrap();
+        let maps = read(folder.path(), 1).unwrap();
+        assert_eq!(maps.iter().copied().collect::<Vec<_>>(), [0.5, 2.25]);
+        std::fs::write(&path, b"not an exr").unwrap();
+        assert!(matches!(
+            read(folder.path(), 1),
+            Err(AnchorError::Malformed { .. })
+        ));
+    }
+}
