@@ -10,12 +10,14 @@ mod gc;
 mod import;
 mod list;
 mod plan;
+mod reconstruct;
 mod request;
 mod run;
 mod schema;
 mod show;
 mod terminal;
 mod verify;
+mod view;
 mod why;
 
 use clap::{CommandFactory as _, Parser as _};
@@ -51,6 +53,8 @@ macro_rules! commands {
 
 // In the order of `reviv --help`.
 commands! {
+    reconstruct::Reconstruct,
+    view::View,
     run::Run,
     check::Check,
     plan::Plan,

@@ -1,7 +1,8 @@
 //! The page of a run, `report/index.html`: state, stages, times, curves, what the ops have to show, settings, origin. One
 //! file, no network, no script.
 //!
-//! An op joins in by leaving `report/*.md`, `report/*.svg` or `report/*.png` in its artifact: they are shown in the order of
+//! An op joins in by leaving `report/*.md`, `report/*.svg` or `report/*.png` in its artifact (or `view.html`, which is linked):
+//! pieces are shown in the order of
 //! their names under the stage's heading.
 
 use super::cache::Cache;
@@ -37,6 +38,7 @@ pub fn write(directory: &RunDirectory) -> Result<(), RunError> {
     plots(&mut page, &schedule, directory, &cache)?;
     for work in &schedule.works {
         sections(&mut page, work, &schedule, &cache)?;
+        linked(&mut page, work, &schedule, directory, &cache)?;
     }
     origin(&mut page, directory);
     page += "</main></body></html>\n";
@@ -234,6 +236,33 @@ fn sections(
             _ => {}
         }
     }
+    Ok(())
+}
+
+/// A page of its own that an op left (`view.html`), copied beside this one and linked.
+fn linked(
+    page: &mut String,
+    work: &Work,
+    schedule: &Schedule,
+    directory: &RunDirectory,
+    cache: &Cache,
+) -> Result<(), RunError> {
+    let own = cache.path(&work.key).join("view.html");
+    if !own.is_file() {
+        return Ok(());
+    }
+    let name = format!("{}.html", work.directory.replace('/', "-"));
+    let report = directory.report();
+    let folder = report.parent().unwrap_or(directory.path());
+    files::create_directory(folder)?;
+    let copy = folder.join(&name);
+    std::fs::copy(&own, &copy).at("writing", &copy)?;
+    let _ = writeln!(
+        page,
+        "<h2>{}</h2>\n<p><a href=\"{name}\">See the reconstruction</a> (one page, works offline)</p>",
+        escape(&work.label(schedule.sweep)),
+        name = escape(&name),
+    );
     Ok(())
 }
 

@@ -1,0 +1,265 @@
+//! `reviv reconstruct`: `experiments/reconstruct.yaml` with a video and a model.
+
+use super::request::open;
+use super::run::{Place, interruptible, progress, tell};
+use super::terminal::{Failure, Terminal};
+use crate::experiment::catalog::Catalog;
+use crate::experiment::load::Request;
+use crate::reconstruction::folder::Manifest;
+use crate::run::execute::{Job, Outcome, cache_of, execute};
+use crate::run::schedule::Schedule;
+use crate::run::{Interrupt, RunDirectory, RunError, Shard, State, files, metrics};
+use std::fmt::Write as _;
+use std::path::{Path, PathBuf};
+
+/// The experiment, where there is none beside the user.
+const EXPERIMENT: &str = include_str!("../../experiments/reconstruct.yaml");
+const FILE: &str = "experiments/reconstruct.yaml";
+const STAGE: &str = "reconstruction";
+
+/// Reconstruct the wearer and the world from one video
+///
+/// Makes a folder with the camera path, body, hands, gaze, depth, points and a page to look at (`view.html`), and prints what it
+/// assumed. It runs `experiments/reconstruct.yaml`; every other setting is reached with `--set`.
+#[derive(Debug, clap::Args)]
+pub struct Reconstruct {
+    /// A video, or a folder of pictures
+    #[arg(value_name = "VIDEO")]
+    video: PathBuf,
+    /// The folder to make [default: the video's name with `_reconstruction`]
+    #[arg(short, long, value_name = "DIR")]
+    output: Option<PathBuf>,
+    /// A run that trained a model, or a model folder [default: the model of the latest finished run]
+    #[arg(long, value_name = "MODEL")]
+    model: Option<PathBuf>,
+    /// How tokens are generated: `fast`, `paper`, `release`, or your own entry
+    #[arg(long, value_name = "ENTRY")]
+    decoding: Option<String>,
+    /// Horizontal field of view of the centre square, degrees
+    #[arg(long, value_name = "DEGREES")]
+    fov: Option<f64>,
+    /// Metric depth of another model to take the scale from: npz, or a folder of EXR or 16-bit PNG
+    #[arg(long, value_name = "PATH")]
+    anchor: Option<PathBuf>,
+    /// At most so many seconds of the video
+    #[arg(long, value_name = "SECONDS")]
+    seconds: Option<f64>,
+    /// The seed of the decoding
+    #[arg(long, value_name = "N")]
+    seed: Option<u64>,
+    /// Change any other value: `--set stages.reconstruction.overlap=1.5`
+    #[arg(long, value_name = "KEY=VALUE")]
+    set: Vec<String>,
+    #[command(flatten)]
+    place: Place,
+}
+
+impl super::Run for Reconstruct {
+    fn run(self, terminal: &Terminal) -> Result<(), Failure> {
+        if !self.video.exists() {
+            return Err(Failure::input(
+                format!("no file `{}`", self.video.display()),
+                "give the path of a video or of a folder of pictures",
+            ));
+        }
+        let target = self.target()?;
+        let model = self.find_model(terminal)?;
+        let request = self.request(&model)?;
+        terminal.note(format_args!(
+            "experiment  {}\nmodel       {}\n",
+            request.path.display(),
+            model.display()
+        ));
+        let catalog = Catalog::linked();
+        let (experiment, _) = open(&catalog, &request, terminal)?;
+        let interrupt = interruptible(terminal)?;
+        let progress = progress(terminal);
+        let outcome = execute(&Job {
+            experiment: &experiment,
+            runs: &self.place.runs,
+            only: None,
+            shard: Shard::WHOLE,
+            progress: &progress,
+            interrupt: &interrupt,
+        })
+        .map_err(|error| tell(terminal, &error))?;
+        finished(terminal, &outcome, &interrupt)?;
+        let artifact = artifact(&self.place.runs, &outcome).map_err(|e| tell(terminal, &e))?;
+        publish(&artifact, &target).map_err(|error| tell(terminal, &error))?;
+        self.report(terminal, &outcome, &target)
+    }
+}
+
+impl Reconstruct {
+    /// Where the result goes: a new folder, or one that holds an earlier result.
+    fn target(&self) -> Result<PathBuf, Failure> {
+        let target = self.output.clone().unwrap_or_else(|| {
+            let stem = self.video.file_stem().unwrap_or_default().to_string_lossy();
+            PathBuf::from(format!("{stem}_reconstruction"))
+        });
+        let taken = target.exists()
+            && !target.join("view.html").is_file()
+            && std::fs::read_dir(&target).map_or(true, |mut entries| entries.next().is_some());
+        if taken {
+            return Err(Failure::input(
+                format!("`{}` holds something else", target.display()),
+                "name another folder with `-o`",
+            ));
+        }
+        Ok(target)
+    }
+
+    /// The experiment with the video, the model and the other flags.
+    fn request(&self, model: &Path) -> Result<Request, Failure> {
+        let path = if Path::new(FILE).is_file() {
+            PathBuf::from(FILE)
+        } else {
+            let path = self.place.runs.join("reconstruct.yaml");
+            std::fs::create_dir_all(&self.place.runs)
+                .and_then(|()| std::fs::write(&path, EXPERIMENT))
+                .map_err(|error| Failure::machine(format_args!("{}: {error}", path.display())))?;
+            path
+        };
+        let mut set = vec![
+            change("clips", "!unset"),
+            change("model", "!unset"),
+            change("video", &text(&self.video)?),
+            change("model_folder", &text(model)?),
+        ];
+        if let Some(name) = &self.decoding {
+            set.push(change("decoding", name));
+        }
+        if let Some(degrees) = self.fov {
+            set.push(change("lens.field_of_view", &degrees.to_string()));
+        }
+        if let Some(path) = &self.anchor {
+            set.push(change("anchor", &text(path)?));
+        }
+        if let Some(seconds) = self.seconds {
+            set.push(change("seconds", &seconds.to_string()));
+        }
+        set.extend(self.set.iter().cloned());
+        Ok(Request {
+            path,
+            set,
+            seed: self.seed,
+            data_may_be_absent: false,
+        })
+    }
+
+    /// The folder of the model.
+    fn find_model(&self, terminal: &Terminal) -> Result<PathBuf, Failure> {
+        let runs = &self.place.runs;
+        if let Some(given) = &self.model {
+            if given.join("run.json").is_file() || !given.exists() {
+                let run = RunDirectory::named(runs, &given.to_string_lossy())
+                    .map_err(|error| tell(terminal, &error))?;
+                return model_of(&run).ok_or_else(|| {
+                    Failure::input(
+                        format!("run `{}` has no finished model of its own", run.name()),
+                        "name a run with a `train_mget` stage, or a model folder",
+                    )
+                });
+            }
+            return Ok(given.clone());
+        }
+        let mut finished: Vec<(String, RunDirectory)> = RunDirectory::all(runs)
+            .map_err(|error| tell(terminal, &error))?
+            .into_iter()
+            .filter_map(|run| Some((run.read().ok()?.created, run)))
+            .collect();
+        finished.sort_by(|a, b| b.0.cmp(&a.0));
+        finished
+            .iter()
+            .find_map(|(_, run)| model_of(run))
+            .ok_or_else(|| {
+                Failure::input(
+                    format!("no model at hand: no run in `{}` trained one", runs.display()),
+                    "`reviv run experiments/quickstart.yaml` trains a small one in minutes; `reviv import` reads released \
+                     weights; `--model` takes either",
+                )
+            })
+    }
+
+    /// What was made, what was assumed, and where the time went.
+    fn report(&self, terminal: &Terminal, outcome: &Outcome, target: &Path) -> Result<(), Failure> {
+        let manifest: Manifest =
+            files::read_json(&target.join("manifest.json")).map_err(|e| tell(terminal, &e))?;
+        let mut text = String::from("\n");
+        for [label, value] in &manifest.assumptions {
+            let _ = writeln!(text, "{label:<12}{value}");
+        }
+        let _ = writeln!(text, "{:<12}{}", "Depth", manifest.scale.words());
+        if let Some(reason) = &manifest.refused {
+            let _ = writeln!(text, "{:<12}no metric scale: {reason}", "");
+        }
+        let stage = outcome.run.path().join("stages").join(STAGE);
+        if let Ok(rows) = metrics::read(&stage)
+            && let Some(row) = rows.last()
+        {
+            text.push('\n');
+            for (name, seconds) in &row.scalars {
+                let part = name.trim_start_matches("seconds/");
+                let each = seconds / row.step.max(1) as f64;
+                let _ = writeln!(text, "{part:<16}{seconds:>8.2} s {each:>8.3} s per window");
+            }
+        }
+        terminal.note(text);
+        terminal.data(format_args!("{}\n", target.join("view.html").display()));
+        Ok(())
+    }
+}
+
+fn change(key: &str, value: &str) -> String {
+    format!("stages.{STAGE}.{key}={value}")
+}
+
+/// A path as a YAML string that does not depend on where the experiment lies.
+fn text(path: &Path) -> Result<String, Failure> {
+    let absolute = std::path::absolute(path).map_err(Failure::machine)?;
+    Ok(serde_json::Value::from(absolute.to_string_lossy()).to_string())
+}
+
+/// The model that a run trained, or used: the last one of its plan that is in the cache.
+fn model_of(run: &RunDirectory) -> Option<PathBuf> {
+    let schedule: Schedule = files::read_json(&run.path().join("plan.json")).ok()?;
+    let cache = cache_of(run.runs());
+    let models = schedule.works.iter().rev().filter(|work| work.kind == "mget");
+    models
+        .filter(|work| cache.contains(&work.key))
+        .map(|work| cache.path(&work.key))
+        .next()
+}
+
+fn finished(terminal: &Terminal, outcome: &Outcome, interrupt: &Interrupt) -> Result<(), Failure> {
+    for error in &outcome.failures {
+        tell(terminal, error);
+    }
+    match outcome.state {
+        State::Done => Ok(()),
+        State::Interrupted if interrupt.requested() => Err(Failure::Ended(130)),
+        _ => {
+            let worst = outcome.failures.iter().map(RunError::exit_code).max();
+            Err(Failure::Ended(worst.unwrap_or(2)))
+        }
+    }
+}
+
+/// Where the reconstruction lies in the cache.
+fn artifact(runs: &Path, outcome: &Outcome) -> Result<PathBuf, RunError> {
+    let schedule: Schedule = files::read_json(&outcome.run.path().join("plan.json"))?;
+    let work = schedule.works.iter().find(|work| work.stage == STAGE);
+    let work = work.ok_or_else(|| RunError::Request {
+        message: format!("the experiment has no stage `{STAGE}`"),
+        help: format!("`{FILE}` names it so"),
+    })?;
+    Ok(cache_of(runs).path(&work.key))
+}
+
+/// Copies the result to where it was asked for; what an earlier result left there goes.
+fn publish(artifact: &Path, target: &Path) -> Result<(), RunError> {
+    if target.exists() {
+        files::remove(target)?;
+    }
+    files::copy_tree(artifact, target)
+}
