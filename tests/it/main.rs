@@ -20,6 +20,7 @@ mod trajectories;
 mod vrs_writer;
 
 mod kill;
+mod kill_binary;
 mod language;
 mod language_ops;
 mod plugins;
