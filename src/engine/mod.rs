@@ -57,6 +57,12 @@ pub enum EngineError {
     NotFinite { name: String },
     #[error("{path}: {reason}")]
     File { path: String, reason: String },
+    #[error("{path}: {error}")]
+    Write {
+        path: String,
+        #[source]
+        error: std::io::Error,
+    },
     #[error("segments: {0}")]
     Segments(String),
 }

@@ -233,9 +233,9 @@ impl Weights {
     /// # Errors
     /// When it cannot be written.
     pub fn write(&self, path: &Path) -> Result<(), EngineError> {
-        let refuse = |error: std::io::Error| EngineError::File {
+        let refuse = |error: std::io::Error| EngineError::Write {
             path: path.display().to_string(),
-            reason: error.to_string(),
+            error,
         };
         let folder = match path.parent() {
             Some(parent) if !parent.as_os_str().is_empty() => parent,

@@ -83,7 +83,11 @@ impl ScoreSet {
 #[derive(Debug, thiserror::Error)]
 pub enum ScoresError {
     #[error("{path}: {error}")]
-    Io { path: String, error: std::io::Error },
+    Io {
+        path: String,
+        #[source]
+        error: std::io::Error,
+    },
     #[error("{path}: not a scores file: {error}")]
     Json {
         path: String,

@@ -17,7 +17,11 @@ pub struct TimedPoses {
 #[derive(Debug, thiserror::Error)]
 pub enum TumError {
     #[error("{path}: {error}")]
-    Io { path: String, error: std::io::Error },
+    Io {
+        path: String,
+        #[source]
+        error: std::io::Error,
+    },
     #[error("{path}:{line}: {reason}")]
     Line {
         path: String,

@@ -28,7 +28,7 @@ pub enum FormatError {
     /// The archive has no member of this name.
     #[error("no `{name}` in the archive; it holds {present}")]
     Missing { name: String, present: String },
-    #[error(transparent)]
+    #[error("{0}")]
     Io(#[from] std::io::Error),
     /// Any of the above, with the file it happened in.
     #[error("{}: {source}", path.display())]

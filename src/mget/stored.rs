@@ -18,6 +18,12 @@ pub enum StoredError {
     #[error("{path}: {reason}")]
     File { path: PathBuf, reason: String },
     #[error("{path}: {error}")]
+    Write {
+        path: PathBuf,
+        #[source]
+        error: std::io::Error,
+    },
+    #[error("{path}: {error}")]
     Spec { path: PathBuf, error: SpecError },
     #[error(transparent)]
     Weights(#[from] EngineError),
@@ -30,13 +36,11 @@ impl Mget {
     /// When a file cannot be written.
     pub fn save(&self, directory: &Path) -> Result<(), StoredError> {
         let path = directory.join(SPEC);
-        let file = |reason: String| StoredError::File {
+        let text = serde_json::to_vec_pretty(self.spec()).map_err(|error| StoredError::File {
             path: path.clone(),
-            reason,
-        };
-        let text =
-            serde_json::to_vec_pretty(self.spec()).map_err(|error| file(error.to_string()))?;
-        std::fs::write(&path, text).map_err(|error| file(error.to_string()))?;
+            reason: error.to_string(),
+        })?;
+        std::fs::write(&path, text).map_err(|error| StoredError::Write { path, error })?;
         self.weights().write(&directory.join(WEIGHTS))?;
         Ok(())
     }

@@ -85,7 +85,11 @@ pub enum PredictionsError {
     #[error(transparent)]
     Format(#[from] FormatError),
     #[error("{path}: {error}")]
-    Io { path: String, error: std::io::Error },
+    Io {
+        path: String,
+        #[source]
+        error: std::io::Error,
+    },
     #[error("{path}: {reason}")]
     Content { path: String, reason: String },
 }

@@ -64,6 +64,12 @@ pub enum TrainingError {
     Engine(#[from] EngineError),
     #[error("{path}: {reason}")]
     Checkpoint { path: PathBuf, reason: String },
+    #[error("{path}: {error}")]
+    Write {
+        path: PathBuf,
+        #[source]
+        error: std::io::Error,
+    },
 }
 
 impl Trainer {
@@ -177,7 +183,7 @@ impl Trainer {
         let path = directory.join(PROGRESS);
         let text =
             serde_json::to_vec_pretty(&self.progress).map_err(|error| checkpoint(&path, &error))?;
-        std::fs::write(&path, text).map_err(|error| checkpoint(&path, &error))
+        std::fs::write(&path, text).map_err(|error| TrainingError::Write { path, error })
     }
 
     /// Continues from a directory of [`Trainer::save`]: the next steps are those the stored run would have taken, to the bit.

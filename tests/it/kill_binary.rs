@@ -11,7 +11,7 @@ use std::time::{Duration, Instant};
 const KILLS: u64 = 10;
 const STEPS: u64 = 12;
 
-const BASE: &str = "
+pub const BASE: &str = "
 experiment: killed
 stages:
   clips: {op: clips, source: {use: world_small, world: {size: 8, rooms: 3}}, train: 4, validation: 2}
@@ -59,7 +59,10 @@ fn a_sweep_of_real_ops_killed_ten_times_ends_with_the_bytes_of_an_untouched_one(
     let folder = tempfile::tempdir().unwrap();
     std::fs::write(folder.path().join("base.yaml"), BASE).unwrap();
     std::fs::write(folder.path().join("sweep.yaml"), SWEEP).unwrap();
-    let (untouched, killed) = (folder.path().join("untouched"), folder.path().join("killed"));
+    let (untouched, killed) = (
+        folder.path().join("untouched"),
+        folder.path().join("killed"),
+    );
     let start = Instant::now();
     complete(folder.path(), &untouched);
     let whole = start.elapsed();

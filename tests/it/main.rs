@@ -5,6 +5,7 @@ mod bad_input;
 mod diagnostics;
 mod egom2p_examples;
 mod evaluation;
+mod full_disk;
 mod metrics;
 mod parity;
 mod reconstruction;

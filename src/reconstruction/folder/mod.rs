@@ -66,6 +66,7 @@ pub enum FolderError {
     #[error("{path}: {error}")]
     Io {
         path: PathBuf,
+        #[source]
         error: std::io::Error,
     },
     #[error(transparent)]
