@@ -224,7 +224,11 @@ fn text(path: &Path) -> Result<String, Failure> {
 fn model_of(run: &RunDirectory) -> Option<PathBuf> {
     let schedule: Schedule = files::read_json(&run.path().join("plan.json")).ok()?;
     let cache = cache_of(run.runs());
-    let models = schedule.works.iter().rev().filter(|work| work.kind == "mget");
+    let models = schedule
+        .works
+        .iter()
+        .rev()
+        .filter(|work| work.kind == "mget");
     models
         .filter(|work| cache.contains(&work.key))
         .map(|work| cache.path(&work.key))

@@ -30,9 +30,8 @@ impl super::Run for View {
                     "leave out `-o`, and copy the one you want",
                 ));
             };
-            std::fs::copy(page, output).map_err(|error| {
-                Failure::machine(format_args!("{}: {error}", output.display()))
-            })?;
+            std::fs::copy(page, output)
+                .map_err(|error| Failure::machine(format_args!("{}: {error}", output.display())))?;
             terminal.data(format_args!("{}\n", output.display()));
             return Ok(());
         }

@@ -4,9 +4,7 @@
 //! (`tokenizers/<modality>/`), and [`FILE`], which says what clips it takes and names the tokenizers by their bytes, so that a
 //! model and tokenizers that do not belong together are found before anything is decoded into nonsense.
 
-use super::{
-    DecodingError, DecodingSettings, GeneratedTokens, MgetTokens, Sample, Slot, generate,
-};
+use super::{DecodingError, DecodingSettings, GeneratedTokens, MgetTokens, Sample, Slot, generate};
 use crate::clip::{Clip, Signal};
 use crate::engine::Compute;
 use crate::masking::PIXELS;
@@ -52,7 +50,9 @@ pub enum ReconstructorError {
         expected: String,
         found: String,
     },
-    #[error("the tokenizer of `{modality}` has {found} tokens a clip of {vocabulary} kinds, the model expects {expected}")]
+    #[error(
+        "the tokenizer of `{modality}` has {found} tokens a clip of {vocabulary} kinds, the model expects {expected}"
+    )]
     OtherGrid {
         modality: String,
         found: String,
@@ -95,7 +95,8 @@ impl Binding {
     /// When it cannot be written.
     pub fn write(&self, folder: &Path) -> Result<(), ReconstructorError> {
         let path = folder.join(FILE);
-        let text = serde_json::to_string_pretty(self).map_err(|error| not_a_model(folder, error))?;
+        let text =
+            serde_json::to_string_pretty(self).map_err(|error| not_a_model(folder, error))?;
         std::fs::write(&path, text + "\n").map_err(|error| ReconstructorError::Io { path, error })
     }
 
@@ -209,7 +210,10 @@ impl Reconstructor {
             }
             let path = folder.join(TOKENIZERS).join(name);
             let expected = binding.tokenizers.get(name).ok_or_else(|| {
-                not_a_model(folder, format_args!("`{FILE}` names no tokenizer of `{name}`"))
+                not_a_model(
+                    folder,
+                    format_args!("`{FILE}` names no tokenizer of `{name}`"),
+                )
             })?;
             if !path.is_dir() {
                 return Err(not_a_model(

@@ -2,8 +2,8 @@
 //!
 //! Writes a folder of [`crate::reconstruction::predictions`]: decoded signals with a confidence per sample.
 
-use crate::clip::store::ClipSet;
 use crate::clip::Clip;
+use crate::clip::store::ClipSet;
 use crate::decoding::{DecodingSettings, Reconstructor, ReconstructorError, Wish};
 use crate::engine::Compute;
 use crate::experiment::{
@@ -196,8 +196,7 @@ impl Op for Predict {
         context: &mut dyn StageContext,
     ) -> Result<Value, StageError> {
         let model = artifact(context, "model")?;
-        let reconstructor =
-            Reconstructor::open(&model.path, &Compute::cpu()).map_err(refused)?;
+        let reconstructor = Reconstructor::open(&model.path, &Compute::cpu()).map_err(refused)?;
         let root = artifact(context, "clips")?.path.join(&settings.split);
         let clips = ClipSet::open(&root).map_err(StageError::other)?;
         let total = clips.len().min(settings.limit.unwrap_or(usize::MAX));
@@ -283,9 +282,7 @@ pub(super) fn refused(error: ReconstructorError) -> StageError {
         ReconstructorError::OtherTokenizer { .. } | ReconstructorError::OtherGrid { .. } => {
             "import or train the model together with its tokenizers"
         }
-        ReconstructorError::NotGiven { .. } => {
-            "leave it out of `given`, or use clips that have it"
-        }
+        ReconstructorError::NotGiven { .. } => "leave it out of `given`, or use clips that have it",
         ReconstructorError::UnknownModality { .. }
         | ReconstructorError::Clip { .. }
         | ReconstructorError::Tokenizer(_) => "use clips of the form the model was trained on",

@@ -130,10 +130,14 @@ impl Op for Reconstruct {
             })
             .collect();
         if let Some(folder) = &settings.model_folder {
-            files.extend(model_files(folder.as_ref()).into_iter().map(|path| FileInput {
-                key: "model_folder".to_owned(),
-                path,
-            }));
+            files.extend(
+                model_files(folder.as_ref())
+                    .into_iter()
+                    .map(|path| FileInput {
+                        key: "model_folder".to_owned(),
+                        path,
+                    }),
+            );
         }
         files
     }
@@ -201,12 +205,7 @@ impl Op for Reconstruct {
         Description::default()
     }
 
-    fn plan(
-        &self,
-        _settings: &ReconstructSettings,
-        _inputs: &Inputs<'_>,
-        _seed: u64,
-    ) -> StagePlan {
+    fn plan(&self, _settings: &ReconstructSettings, _inputs: &Inputs<'_>, _seed: u64) -> StagePlan {
         StagePlan::default()
     }
 

@@ -108,7 +108,10 @@ fn folder(path: &Path, frames: usize) -> Result<Array3<f32>, AnchorError> {
         if maps.shape()[1..] != [height, width] {
             return Err(malformed(
                 &files[file],
-                format_args!("{width} x {height} pixels, the first has {:?}", &maps.shape()[1..]),
+                format_args!(
+                    "{width} x {height} pixels, the first has {:?}",
+                    &maps.shape()[1..]
+                ),
             ));
         }
         maps.index_axis_mut(Axis(0), index).assign(&map);
@@ -175,12 +178,16 @@ mod tests {
     fn a_sequence_of_pictures_is_metres_and_zero_is_unknown() {
         let folder = tempfile::tempdir().unwrap();
         for (index, value) in [1500_u16, 0].into_iter().enumerate() {
-            let file = std::fs::File::create(folder.path().join(format!("{index:03}.png"))).unwrap();
+            let file =
+                std::fs::File::create(folder.path().join(format!("{index:03}.png"))).unwrap();
             let mut encoder = png::Encoder::new(file, 2, 1);
             encoder.set_color(png::ColorType::Grayscale);
             encoder.set_depth(png::BitDepth::Sixteen);
             let mut writer = encoder.write_header().unwrap();
-            let data: Vec<u8> = [value, value].iter().flat_map(|v| v.to_be_bytes()).collect();
+            let data: Vec<u8> = [value, value]
+                .iter()
+                .flat_map(|v| v.to_be_bytes())
+                .collect();
             writer.write_image_data(&data).unwrap();
         }
         let maps = read(folder.path(), 2).unwrap();

@@ -50,13 +50,14 @@ pub struct Calibration {
 pub enum LensError {
     #[error("a field of view of {0} degrees is not between 1 and 170")]
     FieldOfView(f64),
-    #[error("the calibration has a focal length that is not positive, or a value that is not finite")]
+    #[error(
+        "the calibration has a focal length that is not positive, or a value that is not finite"
+    )]
     Calibration,
-    #[error("the calibration is for {expected:?} pixels, the video has {found:?}: not the same shape")]
-    Shape {
-        expected: [u32; 2],
-        found: [u32; 2],
-    },
+    #[error(
+        "the calibration is for {expected:?} pixels, the video has {found:?}: not the same shape"
+    )]
+    Shape { expected: [u32; 2], found: [u32; 2] },
     #[error("`up` is zero, not finite, or along the camera's right axis")]
     Up,
 }
@@ -66,7 +67,11 @@ impl LensSettings {
     ///
     /// # Errors
     /// When a number cannot be that of a camera, or the calibration is for pictures of another shape.
-    pub fn intrinsics(&self, [width, height]: [u32; 2], side: u32) -> Result<Intrinsics, LensError> {
+    pub fn intrinsics(
+        &self,
+        [width, height]: [u32; 2],
+        side: u32,
+    ) -> Result<Intrinsics, LensError> {
         let side_f = f64::from(side);
         let Some(own) = self.calibration else {
             if !(1.0..=170.0).contains(&self.field_of_view) {
@@ -87,7 +92,8 @@ impl LensSettings {
         if numbers.iter().any(|v| !v.is_finite()) || own.fx <= 0.0 || own.fy <= 0.0 {
             return Err(LensError::Calibration);
         }
-        let same = u64::from(own.width) * u64::from(height) == u64::from(own.height) * u64::from(width);
+        let same =
+            u64::from(own.width) * u64::from(height) == u64::from(own.height) * u64::from(width);
         if !same || own.width == 0 {
             return Err(LensError::Shape {
                 expected: [own.width, own.height],
@@ -97,9 +103,8 @@ impl LensSettings {
         // Pixel centres are at integers: half a pixel is added before a scale and taken off after it.
         let short = f64::from(own.width.min(own.height));
         let scale = side_f / short;
-        let cut = |centre: f64, size: u32| {
-            (centre + 0.5 - (f64::from(size) - short) / 2.0) * scale - 0.5
-        };
+        let cut =
+            |centre: f64, size: u32| (centre + 0.5 - (f64::from(size) - short) / 2.0) * scale - 0.5;
         Ok(Intrinsics {
             fx: own.fx * scale,
             fy: own.fy * scale,
@@ -141,7 +146,9 @@ mod tests {
 
     #[test]
     fn ninety_degrees_reach_half_a_side_at_half_a_side() {
-        let lens = LensSettings::default().intrinsics([1920, 1080], 256).unwrap();
+        let lens = LensSettings::default()
+            .intrinsics([1920, 1080], 256)
+            .unwrap();
         assert!((lens.fx - 128.0).abs() < 1e-9);
         assert_eq!(lens.cx, 127.5);
     }

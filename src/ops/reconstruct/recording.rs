@@ -44,8 +44,8 @@ impl Recording {
     ) -> Result<Self, StageError> {
         match (&settings.video, clips) {
             (Some(path), _) => {
-                let video =
-                    Video::open_with(path, &settings.reading).map_err(|error| unreadable(&error))?;
+                let video = Video::open_with(path, &settings.reading)
+                    .map_err(|error| unreadable(&error))?;
                 Self::video(settings, video, format)
             }
             (None, Some(artifact)) => Self::clip(settings, artifact, format),
@@ -119,10 +119,10 @@ impl Recording {
         }
         assumptions.extend(said(&settings.lens, &intrinsics));
         Ok(Self {
-            title: video
-                .path()
-                .file_stem()
-                .map_or_else(|| "video".into(), |stem| stem.to_string_lossy().into_owned()),
+            title: video.path().file_stem().map_or_else(
+                || "video".into(),
+                |stem| stem.to_string_lossy().into_owned(),
+            ),
             seconds: settings.seconds.map_or(left, |limit| left.min(limit)),
             intrinsics,
             first: settings.lens.first_pose().map_err(|error| lens(&error))?,

@@ -29,7 +29,11 @@ impl Times {
     }
 
     fn record(&self, context: &mut dyn StageContext, windows: usize) -> Result<(), StageError> {
-        let names: Vec<String> = self.0.keys().map(|part| format!("seconds/{part}")).collect();
+        let names: Vec<String> = self
+            .0
+            .keys()
+            .map(|part| format!("seconds/{part}"))
+            .collect();
         let scalars: Vec<(&str, f64)> = names
             .iter()
             .map(String::as_str)
@@ -52,7 +56,9 @@ pub(super) fn run(
 ) -> Result<Value, StageError> {
     let mut times = Times::default();
     let reconstructor = times
-        .take("open the model", || Reconstructor::open(model, &Compute::cpu()))
+        .take("open the model", || {
+            Reconstructor::open(model, &Compute::cpu())
+        })
         .map_err(refused)?;
     let format = reconstructor.format().clone();
     let given = ["rgb".to_owned()];
