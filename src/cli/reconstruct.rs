@@ -86,7 +86,7 @@ impl super::Run for Reconstruct {
         finished(terminal, &outcome, &interrupt)?;
         let artifact = artifact(&self.place.runs, &outcome).map_err(|e| tell(terminal, &e))?;
         publish(&artifact, &target).map_err(|error| tell(terminal, &error))?;
-        self.report(terminal, &outcome, &target)
+        Self::report(terminal, &outcome, &target)
     }
 }
 
@@ -182,7 +182,7 @@ impl Reconstruct {
     }
 
     /// What was made, what was assumed, and where the time went.
-    fn report(&self, terminal: &Terminal, outcome: &Outcome, target: &Path) -> Result<(), Failure> {
+    fn report(terminal: &Terminal, outcome: &Outcome, target: &Path) -> Result<(), Failure> {
         let manifest: Manifest =
             files::read_json(&target.join("manifest.json")).map_err(|e| tell(terminal, &e))?;
         let mut text = String::from("\n");

@@ -40,7 +40,11 @@ fn refused(folder: &Path, file: &str, code: &str) {
         assert_eq!(output.status.code(), Some(1), "{arguments:?}: {said}");
         assert!(said.contains(code), "{arguments:?} without {code}: {said}");
         assert!(!said.contains("panicked"), "{arguments:?}: {said}");
-        assert!(said.len() < 20_000, "{arguments:?} says {} bytes", said.len());
+        assert!(
+            said.len() < 20_000,
+            "{arguments:?} says {} bytes",
+            said.len()
+        );
         assert!(start.elapsed() < Duration::from_secs(20), "{arguments:?}");
     }
     assert!(!folder.join("runs").exists(), "nothing was begun");
@@ -52,27 +56,60 @@ fn files_that_are_no_experiments_are_refused_at_the_door() {
     for level in 0..1000 {
         let _ = writeln!(block, "{}k:", " ".repeat(level + 1));
     }
-    let mut bomb = String::from("experiment: a\nparams:\n  l0: &l0 [x, x, x, x, x, x, x, x, x, x]\n");
+    let mut bomb =
+        String::from("experiment: a\nparams:\n  l0: &l0 [x, x, x, x, x, x, x, x, x, x]\n");
     for level in 1..12 {
         let below = vec![format!("*l{}", level - 1); 10].join(", ");
         let _ = writeln!(bomb, "  l{level}: &l{level} [{below}]");
     }
     let cases: Vec<(&str, Vec<u8>, &str)> = vec![
         ("empty", Vec::new(), "E0101"),
-        ("binary", b"\x7fELF\x02\x01\x01\x00\x00\xff".to_vec(), "E0101"),
+        (
+            "binary",
+            b"\x7fELF\x02\x01\x01\x00\x00\xff".to_vec(),
+            "E0101",
+        ),
         ("large", b"a: b\n".repeat(2_000_000), "E0101"),
-        ("flow", format!("experiment: {}{}", "[".repeat(1000), "]".repeat(1000)).into(), "E0103"),
+        (
+            "flow",
+            format!("experiment: {}{}", "[".repeat(1000), "]".repeat(1000)).into(),
+            "E0103",
+        ),
         ("block", block.into(), "E0103"),
         ("bomb", bomb.into(), "E0103"),
         ("itself", b"experiment: &a [*a]\n".to_vec(), "E0102"),
-        ("tabs", b"experiment: a\nstages:\n\tclips: {op: clips}\n".to_vec(), "E0102"),
+        (
+            "tabs",
+            b"experiment: a\nstages:\n\tclips: {op: clips}\n".to_vec(),
+            "E0102",
+        ),
         ("latin", b"experiment: caf\xe9\n".to_vec(), "E0101"),
         ("wide", b"\xff\xfee\x00x\x00".to_vec(), "E0101"),
-        ("circle", b"extends: circle.yaml\nexperiment: a\n".to_vec(), "E0104"),
-        ("one", b"extends: other.yaml\nexperiment: a\n".to_vec(), "E0104"),
-        ("stages", b"experiment: a\nstages: {s: {op: statistics, clips: stages/s}}\n".to_vec(), "E0302"),
-        ("base", b"sweep: a\nbase: base.yaml\narms: {a: {}}\n".to_vec(), "E0104"),
-        ("set", b"experiment: ''\nseed: -1\nstages: [1]\n".to_vec(), "E0202"),
+        (
+            "circle",
+            b"extends: circle.yaml\nexperiment: a\n".to_vec(),
+            "E0104",
+        ),
+        (
+            "one",
+            b"extends: other.yaml\nexperiment: a\n".to_vec(),
+            "E0104",
+        ),
+        (
+            "stages",
+            b"experiment: a\nstages: {s: {op: statistics, clips: stages/s}}\n".to_vec(),
+            "E0302",
+        ),
+        (
+            "base",
+            b"sweep: a\nbase: base.yaml\narms: {a: {}}\n".to_vec(),
+            "E0104",
+        ),
+        (
+            "set",
+            b"experiment: ''\nseed: -1\nstages: [1]\n".to_vec(),
+            "E0202",
+        ),
     ];
     for (name, bytes, code) in cases {
         let folder = tempfile::tempdir().unwrap();
@@ -92,7 +129,12 @@ fn files_that_are_no_experiments_are_refused_at_the_door() {
 #[test]
 fn what_lies_beside_an_experiment_is_no_more_trusted() {
     for (name, code) in [("registry/masking/a.yaml", "E0"), ("data.yaml", "E010")] {
-        for bytes in [&b"\x00\x01\x02"[..], b"\xff\xfe\xfd", b"masking: uniform\n\t- x\n", b"{{{{"] {
+        for bytes in [
+            &b"\x00\x01\x02"[..],
+            b"\xff\xfe\xfd",
+            b"masking: uniform\n\t- x\n",
+            b"{{{{",
+        ] {
             let folder = tempfile::tempdir().unwrap();
             let path = folder.path().join(name);
             std::fs::create_dir_all(path.parent().unwrap()).unwrap();
@@ -103,7 +145,14 @@ fn what_lies_beside_an_experiment_is_no_more_trusted() {
     }
     let folder = tempfile::tempdir().unwrap();
     std::fs::write(folder.path().join("a.yaml"), SMALL).unwrap();
-    for set in ["", "=", "stages", "stages.clips.train={{{", "a.b.c.d=[", "stages.clips.train=&a [*a]"] {
+    for set in [
+        "",
+        "=",
+        "stages",
+        "stages.clips.train={{{",
+        "a.b.c.d=[",
+        "stages.clips.train=&a [*a]",
+    ] {
         let output = reviv(&["check", "a.yaml", "--set", set], folder.path());
         assert_eq!(output.status.code(), Some(1), "{set}: {}", said(&output));
         assert!(!said(&output).contains("panicked"), "{set}");
@@ -163,9 +212,10 @@ fn a_run_that_another_live_process_owns_is_refused_by_name() {
     let start = Instant::now();
     let working = || {
         let runs = reviv::run::RunDirectory::all(&folder.path().join("runs")).unwrap_or_default();
-        runs.iter().any(|run| run.path().join("stages/clips/stage.json").exists())
+        runs.iter()
+            .any(|run| run.path().join("stages/clips/stage.json").exists())
     };
-    while !working() && start.elapsed() < Duration::from_secs(60) {
+    while !working() && start.elapsed() < Duration::from_mins(1) {
         std::thread::sleep(Duration::from_millis(20));
     }
     let output = reviv(&["run", "a.yaml"], folder.path());
@@ -174,7 +224,10 @@ fn a_run_that_another_live_process_owns_is_refused_by_name() {
     owner.wait().unwrap();
     let said = said(&output);
     assert_eq!(output.status.code(), Some(1), "{said}");
-    assert!(said.contains("error[E0801]") && said.contains(&pid), "{said}");
+    assert!(
+        said.contains("error[E0801]") && said.contains(&pid),
+        "{said}"
+    );
 }
 
 #[cfg(target_os = "linux")]
@@ -195,13 +248,20 @@ fn a_folder_that_cannot_be_written_is_refused_with_the_way_out() {
         Ok(output) if !said(&output).contains("unshare") && !said(&output).contains("mount:") => {
             let said = said(&output);
             assert_eq!(output.status.code(), Some(1), "{said}");
-            assert!(said.contains("error[E0802]") && said.contains("--runs DIR"), "{said}");
+            assert!(
+                said.contains("error[E0802]") && said.contains("--runs DIR"),
+                "{said}"
+            );
         }
         _ => eprintln!("skipped: no disk of one's own in a user namespace here"),
     }
     // Where a file stands in the way, nobody gets through.
     std::fs::write(folder.path().join("file"), "").unwrap();
     let output = reviv(&["run", "a.yaml", "--runs", "file/runs"], folder.path());
-    assert!(matches!(output.status.code(), Some(1 | 2)), "{}", said(&output));
+    assert!(
+        matches!(output.status.code(), Some(1 | 2)),
+        "{}",
+        said(&output)
+    );
     assert!(!said(&output).contains("panicked"));
 }

@@ -2,6 +2,7 @@
 #![allow(clippy::unwrap_used)] // A test that cannot go on should stop where it is.
 
 mod bad_input;
+mod bad_input_binary;
 mod diagnostics;
 mod egom2p_examples;
 mod evaluation;

@@ -14,6 +14,7 @@ use crate::run::environment::Stopwatch;
 use crate::view::Fact;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
+use std::fmt::Write as _;
 use std::path::Path;
 
 /// Seconds by part of the work.
@@ -43,7 +44,7 @@ impl Times {
         let mut text = String::from("| part | seconds | per window |\n|---|---|---|\n");
         for (part, seconds) in &self.0 {
             let each = seconds / windows.max(1) as f64;
-            text += &format!("| {part} | {seconds:.2} | {each:.3} |\n");
+            let _ = writeln!(text, "| {part} | {seconds:.2} | {each:.3} |");
         }
         context.record_text(windows as u64, "time", &text)
     }
