@@ -25,6 +25,9 @@ pub struct Import {
     /// Frames and pixels per token of a video tokenizer that is not named after them: 4x8x8 or 8x16x16
     #[arg(long, value_name = "TxHxW")]
     video: Option<String>,
+    /// Clips of a video tokenizer that is imported without a transformer: 16x256x256 unless given
+    #[arg(long, value_name = "FxHxW")]
+    clip: Option<String>,
     /// Write JSON to stdout
     #[arg(long)]
     json: bool,
@@ -41,9 +44,19 @@ impl super::Run for Import {
             })?),
             None => None,
         };
+        let clip = match &self.clip {
+            Some(text) => Some(parse_clip(text).ok_or_else(|| {
+                Failure::input(
+                    format!("`--clip {text}` is not a size"),
+                    "write it as `16x256x256`: frames, height and width",
+                )
+            })?),
+            None => None,
+        };
         let options = ImportOptions {
             heads: self.heads,
             compression,
+            clip,
         };
         let report = import(&self.files, &self.output, &options).map_err(failure)?;
         for notice in &report.notices {
@@ -72,6 +85,15 @@ impl super::Run for Import {
         terminal.data(format_args!("{}\n", report.folder.display()));
         Ok(())
     }
+}
+
+/// `16x256x256` as frames, height and width.
+fn parse_clip(text: &str) -> Option<[usize; 3]> {
+    let parts: Option<Vec<usize>> = text.split('x').map(|part| part.parse().ok()).collect();
+    parts?
+        .try_into()
+        .ok()
+        .filter(|clip: &[usize; 3]| !clip.contains(&0))
 }
 
 /// Lists the entries of a checkpoint, without loading them.

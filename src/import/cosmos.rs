@@ -72,6 +72,7 @@ pub fn plan(checkpoint: &Checkpoint, compression: Option<[usize; 2]>) -> Result<
         family: "cosmos",
         rules,
         settings: serde_json::to_value(settings).map_err(|e| e.to_string())?,
+        grid: None,
     })
 }
 
@@ -178,27 +179,13 @@ fn settings(
 }
 
 /// Names and shapes of the parameters of a network of these sizes.
-///
-/// Every side of every shape is linear in the number of channels, so two narrow networks tell all, without the memory of a
-/// wide one.
 fn inventory(settings: &VideoSettings) -> Result<BTreeMap<String, Vec<usize>>, String> {
     let compute = Compute::cpu();
-    let narrow = |channels: usize| -> Result<Vec<(String, Vec<usize>, _)>, String> {
-        let settings = VideoSettings {
-            channels,
-            ..settings.clone()
-        };
-        let network = Network::new(&Initialise::to_load(&compute), &settings);
-        Ok(network.map_err(|e| e.to_string())?.inventory())
-    };
-    let wide = |one: usize, two: usize| one + (two - one) * (settings.channels - 1);
-    Ok(narrow(1)?
+    let network = Network::new(&Initialise::planned(&compute), settings);
+    let all = network.map_err(|e| e.to_string())?.inventory();
+    Ok(all
         .into_iter()
-        .zip(narrow(2)?)
-        .map(|((name, one, _), (_, two, _))| {
-            let shape = one.iter().zip(&two).map(|(a, b)| wide(*a, *b)).collect();
-            (name, shape)
-        })
+        .map(|(name, shape, _)| (name, shape))
         .collect())
 }
 

@@ -199,6 +199,7 @@ pub fn plan(checkpoint: &Checkpoint, heads: Option<usize>) -> Result<Plan, Strin
             "positions": "released",
             "modalities": described?,
         }),
+        grid: None,
     })
 }
 

@@ -3,21 +3,26 @@
 //! Read in this order: [`pickle`] (an interpreter that can only describe data), [`checkpoint`] (the entries of a `.pth`, a
 //! TorchScript archive or a safetensors file, streamed), [`rules`] (what may happen to an entry), [`mget`], [`vq`] and
 //! [`cosmos`] (which rule applies to which name of which release), [`statistics`] (normalisation files that travel with the
-//! weights) and [`convert`] (the whole import: checks, our files, the manifest).
+//! weights), `source` (one file, checked), `part` (one model of one or several files), `folder` (what our files of it are)
+//! and [`convert`] (the whole import, and the manifest).
 //!
 //! Weights are never part of this product: users get them from their authors, under their authors' licences.
 
 pub mod checkpoint;
 pub mod convert;
 pub mod cosmos;
+mod folder;
+mod hash;
 pub mod mget;
+mod part;
 pub mod pickle;
 pub mod rules;
+mod source;
 pub mod statistics;
 pub mod vq;
 
 pub use checkpoint::{Checkpoint, Entry, Format};
-pub use convert::{ImportOptions, ImportReport, import};
+pub use convert::{ImportOptions, ImportReport, PartReport, import};
 
 use std::path::{Path, PathBuf};
 

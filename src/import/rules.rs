@@ -5,10 +5,13 @@ use super::{Checkpoint, ImportError};
 use crate::nn::positions::{self, GridOrder};
 use serde_json::Value;
 
-/// Position tables must agree with ours to this, as `||a - b|| / ||b||`.
-const TABLE_TOLERANCE: f64 = 1e-6;
-/// No element of a position table may be further off: the references compute angles in f32, which costs a few 1e-6.
-const ELEMENT_TOLERANCE: f32 = 1e-5;
+/// No element of a position table may be further from ours than this.
+const TABLE_TOLERANCE: f32 = 1e-6;
+/// What tells two places of a table apart.
+const PLACE_TOLERANCE: f32 = 1e-5;
+
+/// More values than any position table has: four times that of the release's video.
+const MAX_TABLE: u64 = 1 << 24;
 
 /// The fate of one entry.
 #[derive(Debug, Clone, PartialEq)]
@@ -50,6 +53,19 @@ pub struct Plan {
     pub rules: Vec<Rule>,
     /// What the tensors and arguments say about the model. Grids are filled in once position tables have been read.
     pub settings: Value,
+    /// The token grid of a VQ-VAE, once its position tables have been read.
+    pub grid: Option<Vec<usize>>,
+}
+
+impl Plan {
+    /// How many tokens a tokenizer has.
+    pub fn vocabulary(&self) -> u64 {
+        let levels = self.settings["levels"].as_array();
+        match levels {
+            Some(levels) => levels.iter().filter_map(Value::as_u64).product(),
+            None => self.settings["codebook"].as_u64().unwrap_or(0),
+        }
+    }
 }
 
 /// What was found for one entry, for the manifest.
@@ -123,6 +139,9 @@ impl Rule {
                 }
             }
             Self::Constant { values } => {
+                if entries_of(checkpoint, index) != values.len() as u64 {
+                    return refuse(format!("has not {} values", values.len()));
+                }
                 let found = checkpoint.values(index)?;
                 // What the entry's own type can tell apart.
                 let tolerance = match checkpoint.entries()[index].scalar() {
@@ -130,11 +149,10 @@ impl Rule {
                     Scalar::F16 => 1.0 / 2048.0,
                     _ => 1e-6,
                 };
-                let same = found.len() == values.len()
-                    && found
-                        .iter()
-                        .zip(values)
-                        .all(|(a, b)| (a - b).abs() <= tolerance * b.abs());
+                let same = found
+                    .iter()
+                    .zip(values)
+                    .all(|(a, b)| (a - b).abs() <= tolerance * b.abs());
                 if !same {
                     return refuse(format!(
                         "holds {:?}.., this product would use {:?}..",
@@ -146,19 +164,21 @@ impl Rule {
             }
             Self::Table { layout, keep } => {
                 let shape = checkpoint.entries()[index].shape();
+                if entries_of(checkpoint, index) > MAX_TABLE {
+                    return refuse(format!("a position table of shape {shape:?}"));
+                }
                 let found = checkpoint.values(index)?;
                 let width = shape.last().copied().unwrap_or(0);
                 let (place, expected) = match layout.expected(&found, width) {
                     Ok(table) => table,
                     Err(reason) => return refuse(reason),
                 };
-                let far = found.len() != expected.len()
-                    || found
-                        .iter()
-                        .zip(&expected)
-                        .any(|(a, b)| a.is_nan() || (a - b).abs() > ELEMENT_TOLERANCE);
-                let error = distance(&found, &expected);
-                if far || error.is_nan() || error > TABLE_TOLERANCE {
+                let error = if found.len() == expected.len() {
+                    distance(&found, &expected)
+                } else {
+                    f32::INFINITY
+                };
+                if error > TABLE_TOLERANCE {
                     return refuse(format!(
                         "differs by {error:.1e} from the position table of a {place:?} grid"
                     ));
@@ -188,8 +208,7 @@ impl Layout {
         let change = |from: usize, to: usize| {
             (1..rows)
                 .find(|row| {
-                    (from..to)
-                        .any(|c| (table[row * width + c] - table[c]).abs() > ELEMENT_TOLERANCE)
+                    (from..to).any(|c| (table[row * width + c] - table[c]).abs() > PLACE_TOLERANCE)
                 })
                 .unwrap_or(rows)
         };
@@ -217,13 +236,20 @@ impl Layout {
     }
 }
 
-/// `||a - b|| / ||b||`.
-fn distance(a: &[f32], b: &[f32]) -> f64 {
-    let square = |values: &mut dyn Iterator<Item = f32>| -> f64 {
-        values.map(|v| f64::from(v) * f64::from(v)).sum()
-    };
-    let off = square(&mut a.iter().zip(b).map(|(a, b)| a - b));
-    (off / square(&mut b.iter().copied()).max(f64::MIN_POSITIVE)).sqrt()
+fn entries_of(checkpoint: &Checkpoint, index: usize) -> u64 {
+    checkpoint.entries()[index].view.elements()
+}
+
+/// The largest difference of two elements; infinite where one is not a number.
+fn distance(a: &[f32], b: &[f32]) -> f32 {
+    a.iter().zip(b).fold(0.0, |worst, (a, b)| {
+        let off = (a - b).abs();
+        if off.is_nan() {
+            f32::INFINITY
+        } else {
+            worst.max(off)
+        }
+    })
 }
 
 /// Whether two entries hold the same values, bit for bit. The first is held in memory.

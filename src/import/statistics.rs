@@ -4,9 +4,13 @@
 //! all its files.
 
 use super::ImportError;
+use super::hash::Hashes;
 use crate::formats::npy;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+
+/// Statistics of 63 numbers have less than a kilobyte.
+const MAX_BYTES: u64 = 1 << 16;
 
 /// Mean and deviation of one modality, row-major over channels (camera) or joints and axes.
 #[derive(Debug, Clone, PartialEq, serde::Serialize, serde::Deserialize)]
@@ -53,10 +57,19 @@ pub fn egom2p_camera() -> Statistics {
     }
 }
 
-/// Reads statistics files; `hashes` gives each file's SHA-256. Every modality needs both of its files.
-pub fn read(
+/// Gaze in [0, 1] becomes [-1, 1] in every release.
+pub fn gaze() -> Statistics {
+    Statistics {
+        mean: vec![0.5; 2],
+        deviation: vec![0.5; 2],
+        sha256: Vec::new(),
+    }
+}
+
+/// Reads statistics files. Every modality needs both of its files.
+pub(super) fn read(
     files: &[PathBuf],
-    hashes: &BTreeMap<PathBuf, String>,
+    hashes: &mut Hashes,
 ) -> Result<BTreeMap<String, Statistics>, ImportError> {
     let mut halves: BTreeMap<(&'static str, bool), (Vec<f32>, PathBuf)> = BTreeMap::new();
     for path in files {
@@ -84,13 +97,12 @@ pub fn read(
             ));
         };
         if *is_mean {
-            let hash = |path: &PathBuf| hashes.get(path).cloned().unwrap_or_default();
             all.insert(
                 (*modality).to_owned(),
                 Statistics {
                     mean: values.clone(),
                     deviation: other.clone(),
-                    sha256: vec![hash(path), hash(other_path)],
+                    sha256: vec![hashes.get(path)?.sha256, hashes.get(other_path)?.sha256],
                 },
             );
         }
@@ -117,6 +129,12 @@ fn name(path: &Path) -> Option<(&'static str, bool)> {
 }
 
 fn values(path: &Path, modality: &str, is_mean: bool) -> Result<Vec<f32>, ImportError> {
+    let length = std::fs::metadata(path)
+        .map_err(ImportError::io(path))?
+        .len();
+    if length > MAX_BYTES {
+        return Err(ImportError::refused(path, format!("{length} bytes")));
+    }
     let array = npy::read(path)?.to::<f32>()?;
     let expected: &[usize] = if modality == "camera" { &[9] } else { &[21, 3] };
     let count: usize = expected.iter().product();

@@ -149,6 +149,7 @@ pub fn plan(checkpoint: &Checkpoint, heads: Option<usize>) -> Result<Plan, Strin
         family: "vq",
         rules,
         settings: serde_json::to_value(settings).map_err(|e| e.to_string())?,
+        grid: None,
     })
 }
 

@@ -1,4 +1,7 @@
-//! Fixed sine-cosine position tables, row-major `[positions, width]`, computed in f64.
+//! Fixed sine-cosine position tables, row-major `[positions, width]`.
+//!
+//! Released models computed theirs in f32, and angles of f32 are off by up to a few 1e-6 at position 30: the frequencies and
+//! angles here are rounded as theirs, which brings the tables within 1e-7 of the released ones.
 
 /// One axis: all sines, then all cosines; frequency `i` of `width / 2` is `10000^(-i / (width / 2))`.
 ///
@@ -8,18 +11,24 @@
 pub fn line(positions: usize, width: usize) -> Vec<f32> {
     assert!(width.is_multiple_of(2), "the width of a line code is even");
     (0..positions)
-        .flat_map(|position| halves(position as f64, width))
+        .flat_map(|position| halves(position, width))
         .collect()
 }
 
 /// `[sin(p w_0) .., cos(p w_0) ..]` of `width` values.
-fn halves(position: f64, width: usize) -> Vec<f32> {
+fn halves(position: usize, width: usize) -> Vec<f32> {
     let half = width / 2;
-    let angle = |i: usize| position * 10_000_f64.powf(-(i as f64) / half as f64);
-    let sines = (0..half).map(|i| angle(i).sin() as f32);
-    sines
-        .chain((0..half).map(|i| angle(i).cos() as f32))
-        .collect()
+    let codes = (0..half).map(|i| sine_cosine(position, i as f32 / half as f32));
+    let (mut code, cosines): (Vec<f32>, Vec<f32>) = codes.unzip();
+    code.extend(cosines);
+    code
+}
+
+/// Sine and cosine of `position * 10000^-exponent`, with power, frequency and angle rounded to f32 one after the other.
+fn sine_cosine(position: usize, exponent: f32) -> (f32, f32) {
+    let frequency = 1.0 / 10_000_f64.powf(f64::from(exponent)) as f32;
+    let angle = f64::from(position as f32 * frequency);
+    (angle.sin() as f32, angle.cos() as f32)
 }
 
 /// Which way a table of a `rows x columns` grid of tokens is enumerated.
@@ -60,8 +69,8 @@ pub fn grid(rows: usize, columns: usize, width: usize, order: GridOrder) -> Vec<
                 GridOrder::Released => (n / rows, n % rows),
                 GridOrder::Aligned => (n % columns, n / columns),
             };
-            let mut code = halves(a as f64, width / 2);
-            code.extend(halves(b as f64, width / 2));
+            let mut code = halves(a, width / 2);
+            code.extend(halves(b, width / 2));
             code
         })
         .collect()
@@ -82,8 +91,8 @@ pub fn volume([times, heights, widths]: [usize; 3], width: usize) -> Vec<f32> {
     let code = |position: usize| -> Vec<f32> {
         (0..channels / 2)
             .flat_map(|j| {
-                let angle = position as f64 * 10_000_f64.powf(-2.0 * j as f64 / channels as f64);
-                [angle.sin() as f32, angle.cos() as f32]
+                let (sine, cosine) = sine_cosine(position, (2 * j) as f32 / channels as f32);
+                [sine, cosine]
             })
             .collect()
     };

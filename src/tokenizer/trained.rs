@@ -1,5 +1,6 @@
 //! A trained VQ-VAE with everything needed to use it: modality, shape, normalisation, weights. One safetensors file.
 
+use std::collections::BTreeMap;
 use std::path::Path;
 
 use ndarray::{ArrayD, IxDyn};
@@ -22,8 +23,9 @@ const FORMAT: &str = "reviv vq tokenizer 1";
 /// Signals per forward pass: memory stays flat in the number of signals.
 const BATCH: usize = 16;
 
-const MEAN: &str = "normalise.mean";
-const DEVIATION: &str = "normalise.deviation";
+/// The names of the statistics beside the weights.
+pub const MEAN: &str = "normalise.mean";
+pub const DEVIATION: &str = "normalise.deviation";
 
 /// A normalised signal, row-major: what a model trains on.
 #[derive(Debug, Clone, PartialEq)]
@@ -96,23 +98,33 @@ impl VqTokenizer {
         for (name, values) in statistics {
             weights.insert_f32(name, values.to_vec(), &[values.len()]);
         }
-        let shape = match &self.shape {
+        weights.metadata = Self::describe(&self.modality, &self.shape, self.model.settings());
+        weights
+    }
+
+    /// What the file of a tokenizer says of itself.
+    #[must_use]
+    pub fn describe(
+        modality: &str,
+        shape: &Shape,
+        settings: &VqSettings,
+    ) -> BTreeMap<String, String> {
+        let shape = match shape {
             Shape::Temporal { samples, channels } => {
                 json!({"samples": samples, "channels": channels})
             }
             Shape::Kinematic { samples, joints } => json!({"samples": samples, "joints": joints}),
             Shape::Video { .. } => Value::Null,
         };
-        let settings = serde_json::to_value(self.model.settings()).unwrap_or(Value::Null);
-        weights.metadata = [
+        let settings = serde_json::to_value(settings).unwrap_or(Value::Null);
+        [
             ("format", FORMAT.to_owned()),
-            ("modality", self.modality.clone()),
+            ("modality", modality.to_owned()),
             ("shape", shape.to_string()),
             ("settings", settings.to_string()),
         ]
         .map(|(key, value)| (key.to_owned(), value))
-        .into();
-        weights
+        .into()
     }
 
     /// Rebuilds a tokenizer from [`VqTokenizer::weights`].
@@ -155,7 +167,7 @@ impl VqTokenizer {
                     ..
                 }) => Ok(values),
                 _ => Err(TokenizerError::Other(format!(
-                    "normalisation statistics `{name}` are missing"
+                    "{modality}: normalisation statistics `{name}` are missing; imported weights need their `norm_stats` files"
                 ))),
             }
         };

@@ -35,4 +35,8 @@ mod vq_structure;
 mod world;
 
 mod import;
+mod import_bad;
+mod import_models;
+mod import_show;
+mod released;
 mod torch;

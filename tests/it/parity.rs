@@ -1,7 +1,7 @@
 //! The numbers of the reference implementation, as far as the vectors are at hand.
 
 #[path = "../../examples/check_parity/mod.rs"]
-mod check_parity;
+pub mod check_parity;
 
 #[test]
 fn every_tensor_of_the_parity_vectors_matches() {

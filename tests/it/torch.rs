@@ -92,6 +92,21 @@ pub fn pickle(tensors: &[(String, Vec<u8>)], arguments: &[(&str, Argument)]) -> 
     out
 }
 
+/// A TorchScript module of modules: `(module, name, tensor)`.
+pub fn script(tensors: &[(&str, &str, Vec<u8>)]) -> Vec<u8> {
+    let mut out = b"\x80\x02c__torch__\nModel\n)\x81}(".to_vec();
+    for (module, name, opcodes) in tensors {
+        text(&mut out, module);
+        out.extend(b"c__torch__.inner\nModule\n)\x81}(");
+        text(&mut out, name);
+        out.extend(opcodes);
+        text(&mut out, "training");
+        out.extend(b"\x89ub");
+    }
+    out.extend(b"ub.");
+    out
+}
+
 /// Writes a `.pth` file; storages are made one at a time.
 pub fn save(out: impl Write, tensors: &[Saved], arguments: &[(&str, Argument)]) {
     let described: Vec<(String, Vec<u8>)> = tensors

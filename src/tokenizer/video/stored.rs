@@ -1,5 +1,6 @@
 //! A video tokenizer as one safetensors file: the network's weights, and what it works on as metadata.
 
+use std::collections::BTreeMap;
 use std::path::Path;
 
 use super::{Network, VideoSettings, VideoTokenizer};
@@ -15,17 +16,28 @@ impl VideoTokenizer {
     #[must_use]
     pub fn weights(&self) -> Weights {
         let mut weights = self.network().weights();
-        let settings = serde_json::to_string(self.settings()).unwrap_or_default();
-        let [frames, height, width] = self.clip();
-        weights.metadata = [
+        weights.metadata = Self::describe(self.modality(), self.clip(), self.settings());
+        weights
+    }
+
+    /// What the file of a tokenizer says of itself.
+    #[must_use]
+    pub fn describe(
+        modality: &str,
+        [frames, height, width]: [usize; 3],
+        settings: &VideoSettings,
+    ) -> BTreeMap<String, String> {
+        [
             ("format", FORMAT.to_owned()),
-            ("modality", self.modality().to_owned()),
+            ("modality", modality.to_owned()),
             ("clip", format!("[{frames},{height},{width}]")),
-            ("settings", settings),
+            (
+                "settings",
+                serde_json::to_string(settings).unwrap_or_default(),
+            ),
         ]
         .map(|(key, value)| (key.to_owned(), value))
-        .into();
-        weights
+        .into()
     }
 
     /// Rebuilds a tokenizer from [`VideoTokenizer::weights`].

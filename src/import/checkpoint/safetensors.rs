@@ -1,0 +1,98 @@
+//! Safetensors: a JSON header with types, shapes and places, then the values.
+
+use super::memory::identify;
+use super::{Checkpoint, Format, Source};
+use crate::import::ImportError;
+use crate::import::pickle::{Scalar, Storage, TensorView};
+use serde_json::{Map, Value};
+use std::collections::BTreeSet;
+use std::fs::File;
+use std::io::{BufReader, Read};
+use std::path::Path;
+
+/// A model of a thousand tensors has a header of a tenth of a megabyte.
+const MAX_HEADER: u64 = 8 << 20;
+
+impl Checkpoint {
+    pub(super) fn safetensors(path: &Path, file: File) -> Result<Self, ImportError> {
+        let refused = |reason: String| ImportError::refused(path, reason);
+        let length = file.metadata().map_err(ImportError::io(path))?.len();
+        let mut file = BufReader::new(file);
+        let mut prefix = [0; 8];
+        file.read_exact(&mut prefix)
+            .map_err(ImportError::io(path))?;
+        let header = u64::from_le_bytes(prefix);
+        if header > (length - 8).min(MAX_HEADER) {
+            return Err(refused(format!("a header of {header} bytes")));
+        }
+        let mut text = vec![0; header as usize];
+        file.read_exact(&mut text).map_err(ImportError::io(path))?;
+        let parsed: Map<String, Value> = serde_json::from_slice(&text)
+            .map_err(|e| refused(format!("the header is not JSON: {e}")))?;
+        let available = length - 8 - header;
+        let mut entries = Vec::new();
+        for (name, entry) in parsed.iter().filter(|(name, _)| *name != "__metadata__") {
+            let view = view(entry, available)
+                .ok_or_else(|| refused(format!("the header's entry for `{name}` is not valid")))?;
+            entries.push((name.clone(), view));
+        }
+        let entries = identify(entries, available).map_err(refused)?;
+        Ok(Self {
+            path: path.to_owned(),
+            format: Format::Safetensors,
+            entries,
+            arguments: Map::new(),
+            others: Vec::new(),
+            source: Source::Flat {
+                file,
+                start: 8 + header,
+            },
+            verified: BTreeSet::new(),
+        })
+    }
+}
+
+/// One entry of the header, checked against the `available` bytes behind it.
+fn view(entry: &Value, available: u64) -> Option<TensorView> {
+    let scalar = match entry["dtype"].as_str()? {
+        "F64" => Scalar::F64,
+        "F32" => Scalar::F32,
+        "F16" => Scalar::F16,
+        "BF16" => Scalar::BF16,
+        "I64" => Scalar::I64,
+        "I32" => Scalar::I32,
+        "I16" => Scalar::I16,
+        "I8" => Scalar::I8,
+        "U8" => Scalar::U8,
+        "BOOL" => Scalar::Bool,
+        _ => return None,
+    };
+    let numbers = |value: &Value| -> Option<Vec<u64>> {
+        value.as_array()?.iter().map(Value::as_u64).collect()
+    };
+    let shape = numbers(&entry["shape"]).filter(|shape| shape.len() <= 8)?;
+    let offsets = numbers(&entry["data_offsets"])?;
+    let [begin, end] = offsets[..] else {
+        return None;
+    };
+    let width = scalar.width() as u64;
+    let elements = shape.iter().try_fold(1u64, |n, &d| n.checked_mul(d))?;
+    let fits = begin <= end
+        && end <= available
+        && elements.checked_mul(width) == Some(end - begin)
+        && begin.is_multiple_of(width);
+    let mut strides = vec![1; shape.len()];
+    for axis in (1..shape.len()).rev() {
+        strides[axis - 1] = strides[axis] * shape[axis].max(1);
+    }
+    fits.then(|| TensorView {
+        storage: Storage {
+            key: String::new(),
+            scalar,
+            elements: available / width,
+        },
+        offset: begin / width,
+        shape,
+        strides,
+    })
+}

@@ -1,0 +1,296 @@
+//! Pickle, read as data: an interpreter with an allow-list that can build numbers, text, containers and descriptions of
+//! tensors, and nothing else.
+//!
+//! A pickle is a program. This one runs on an arena: every object is an index, so that deep nesting cannot overflow the
+//! stack, sharing through the memo cannot multiply memory, and the work is linear in the length of the file. An opcode or a
+//! global name outside the lists is an error that names it; nothing in the file is ever called.
+
+mod machine;
+mod objects;
+mod tensor;
+
+pub use tensor::{Scalar, Storage, TensorView};
+
+use machine::Machine;
+use std::sync::Arc;
+
+/// Why a pickle is refused.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("pickle: byte {offset}: {reason}")]
+pub struct PickleError {
+    pub offset: usize,
+    pub reason: String,
+}
+
+/// An object of the arena.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Id(u32);
+
+/// What a pickle can build here.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Node {
+    None,
+    Bool(bool),
+    Int(i128),
+    Float(f64),
+    Text(String),
+    Bytes(Vec<u8>),
+    Tuple(Vec<Id>),
+    List(Vec<Id>),
+    /// Keys in the order of insertion; `OrderedDict` too.
+    Dict(Vec<(Id, Id)>),
+    /// A global name that stands on the allow-list but has not been applied to anything.
+    Global(Global),
+    /// An instance of `argparse.Namespace` or of a TorchScript class, with the dictionary it was given.
+    Object {
+        class: Arc<str>,
+        state: Option<Id>,
+    },
+    /// A piece of memory in the archive.
+    Storage(Storage),
+    Tensor(TensorView),
+    /// A NumPy type such as `f8`.
+    Dtype(String),
+}
+/// The global names that may appear.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Global {
+    OrderedDict,
+    Namespace,
+    RebuildTensor,
+    RebuildParameter,
+    StorageType(Scalar),
+    NumpyScalar,
+    NumpyDtype,
+    Encode,
+    /// `torch.jit._pickle.build_intlist` and its kin: the list itself.
+    TypedList,
+    /// A class compiled by TorchScript, `__torch__.module.Class`.
+    Script(Arc<str>),
+}
+
+/// The result of reading a pickle.
+#[derive(Debug, Clone)]
+pub struct Pickle {
+    nodes: Vec<Node>,
+    root: Id,
+}
+
+/// More than any checkpoint's object tree; the tensors themselves are elsewhere.
+const MAX_BYTES: usize = 16 << 20;
+/// A training checkpoint of the largest released model has some twenty thousand objects.
+const MAX_NODES: usize = 1 << 19;
+const MAX_TEXT: usize = 1 << 20;
+/// Keys of storages, codes of NumPy types and the bytes of NumPy numbers: names can be called on the same text again and
+/// again, so what a call copies is short.
+const MAX_COPIED: usize = 64;
+
+impl Pickle {
+    /// Reads a pickle.
+    pub fn parse(bytes: &[u8]) -> Result<Self, PickleError> {
+        if bytes.len() > MAX_BYTES {
+            return Err(PickleError {
+                offset: 0,
+                reason: format!("{} bytes; the limit is {MAX_BYTES}", bytes.len()),
+            });
+        }
+        let (nodes, root) = Machine::new(bytes).run()?;
+        Ok(Self { nodes, root })
+    }
+
+    pub fn root(&self) -> Id {
+        self.root
+    }
+
+    pub fn node(&self, id: Id) -> &Node {
+        &self.nodes[id.0 as usize]
+    }
+
+    /// The text of a node that is text.
+    pub fn text(&self, id: Id) -> Option<&str> {
+        match self.node(id) {
+            Node::Text(text) => Some(text),
+            _ => None,
+        }
+    }
+
+    /// The pairs of a dictionary, or of an object's dictionary; empty for anything else.
+    pub fn pairs(&self, id: Id) -> &[(Id, Id)] {
+        match self.node(id) {
+            Node::Dict(pairs) => pairs,
+            Node::Object {
+                state: Some(state), ..
+            } => match self.node(*state) {
+                Node::Dict(pairs) => pairs,
+                _ => &[],
+            },
+            _ => &[],
+        }
+    }
+
+    /// The value under a text key (the last one wins, as in Python).
+    pub fn get(&self, id: Id, key: &str) -> Option<Id> {
+        self.pairs(id)
+            .iter()
+            .rev()
+            .find(|(k, _)| self.text(*k) == Some(key))
+            .map(|(_, v)| *v)
+    }
+}
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn refused(bytes: &[u8]) -> String {
+        Pickle::parse(bytes).unwrap_err().to_string()
+    }
+
+    #[test]
+    fn numbers_texts_and_containers_are_read() {
+        // pickle.dumps({"a": [1, -2, 2.5, None, True], "b": (1 << 40,)}, 2)
+        let bytes = b"\x80\x02}q\x00(X\x01\x00\x00\x00aq\x01]q\x02(K\x01J\xfe\xff\xff\xffG@\x04\x00\x00\x00\x00\x00\x00N\x88eX\x01\x00\x00\x00bq\x03\x8a\x06\x00\x00\x00\x00\x00\x01\x85q\x04u.";
+        let pickle = Pickle::parse(bytes).unwrap();
+        let list = pickle.get(pickle.root(), "a").unwrap();
+        let Node::List(items) = pickle.node(list) else {
+            panic!("not a list")
+        };
+        let nodes: Vec<&Node> = items.iter().map(|&i| pickle.node(i)).collect();
+        assert_eq!(
+            nodes,
+            [
+                &Node::Int(1),
+                &Node::Int(-2),
+                &Node::Float(2.5),
+                &Node::None,
+                &Node::Bool(true)
+            ]
+        );
+        let tuple = pickle.get(pickle.root(), "b").unwrap();
+        let Node::Tuple(items) = pickle.node(tuple) else {
+            panic!("not a tuple")
+        };
+        assert_eq!(pickle.node(items[0]), &Node::Int(1 << 40));
+    }
+
+    #[test]
+    fn whatever_would_run_code_is_refused_by_name() {
+        for (bytes, part) in [
+            (&b"cos\nsystem\n(X\x04\x00\x00\x00truetR."[..], "os.system"),
+            (b"cposix\nsystem\n.", "posix.system"),
+            (b"cbuiltins\neval\n(X\x01\x00\x00\x001tR.", "builtins.eval"),
+            (b"c__builtin__\ngetattr\n.", "getattr"),
+            (b"\x80\x04\x8c\x02os\x8c\x06system\x93.", "os.system"),
+            (b"ctorch.hub\nload\n.", "torch.hub.load"),
+            (b"ctorch\nload\n.", "torch.load"),
+            (b"ccollections\nOrderedDict.__init__\n.", "__init__"),
+            (b"(S'true'\nios\nsystem\n.", "opcode"),
+            (b"\x82\x01.", "opcode"),
+        ] {
+            let error = refused(bytes);
+            assert!(error.contains(part), "{error}");
+        }
+    }
+
+    #[test]
+    fn deep_nesting_and_memo_bombs_cost_no_more_than_their_length() {
+        let mut deep = b"\x80\x02".to_vec();
+        deep.extend(std::iter::repeat_n(b"]", 200_000).flatten());
+        deep.extend(std::iter::repeat_n(b"a", 199_999).flatten());
+        deep.push(b'.');
+        assert_eq!(Pickle::parse(&deep).unwrap().nodes.len(), 200_000);
+        // Sixty lists, each holding the one before twice: 2^60 leaves for a reader that copies.
+        let mut bomb = b"\x80\x02]q\x00".to_vec();
+        for level in 0..60u8 {
+            bomb.extend([
+                b'0',
+                b']',
+                b'q',
+                level + 1,
+                b'(',
+                b'h',
+                level,
+                b'h',
+                level,
+                b'e',
+            ]);
+        }
+        bomb.push(b'.');
+        assert_eq!(Pickle::parse(&bomb).unwrap().nodes.len(), 61);
+    }
+    #[test]
+    fn short_programs_that_copy_much_are_refused() {
+        // A million objects of one byte each.
+        let mut many = b"\x80\x02".to_vec();
+        many.extend(std::iter::repeat_n(b'N', 1 << 20));
+        many.push(b'.');
+        assert!(refused(&many).contains("objects"));
+        // One long text, behind calls that would copy it.
+        let mut long = vec![b'X', 0, 0, 1, 0];
+        long.extend(std::iter::repeat_n(b'8', 1 << 16));
+        let call = |before: &[u8], after: &[u8]| refused(&[before, &long, after].concat());
+        assert!(call(b"cnumpy\ndtype\n", b"\x85R.").contains("65536"));
+        assert!(call(b"c_codecs\nencode\n", b"X\x06\x00\x00\x00latin1\x86R.").contains("65536"));
+        let storage = b"(X\x07\x00\x00\x00storagectorch\nFloatStorage\n";
+        assert!(call(storage, b"NK\x01tQ.").contains("65536"));
+        // A call with a thousand arguments.
+        let mut wide = b"ctorch._utils\n_rebuild_tensor_v2\n(".to_vec();
+        wide.extend(std::iter::repeat_n(b'N', 1000));
+        wide.extend(b"tR.");
+        assert!(refused(&wide).contains("1000 arguments"));
+    }
+
+    /// Opcodes that make progress, so that random programs get further than their first byte.
+    fn program() -> impl Strategy<Value = Vec<u8>> {
+        let pieces: Vec<&'static [u8]> = vec![
+            b"]",
+            b"}",
+            b")",
+            b"(",
+            b"a",
+            b"e",
+            b"s",
+            b"u",
+            b"t",
+            b"0",
+            b"1",
+            b"N",
+            b"K\x03",
+            b"q\x00",
+            b"h\x00",
+            b"h\x01",
+            b"q\x01",
+            b"\x85",
+            b"\x86",
+            b"\x87",
+            b"R",
+            b"b",
+            b"Q",
+            b"\x81",
+            b"X\x01\x00\x00\x00a",
+            b"X\x07\x00\x00\x00storage",
+            b"ctorch\nFloatStorage\n",
+            b"ctorch._utils\n_rebuild_tensor_v2\n",
+            b"ccollections\nOrderedDict\n",
+            b"cnumpy\ndtype\n",
+            b"\x8a\x02\xff\xff",
+            b"G\x00\x00\x00\x00\x00\x00\x00\x00",
+            b"c__torch__.a\nB\n",
+        ];
+        proptest::collection::vec(proptest::sample::select(pieces), 0..60)
+            .prop_map(|pieces| pieces.concat())
+    }
+
+    proptest! {
+        #[test]
+        fn no_bytes_make_it_panic(bytes in proptest::collection::vec(any::<u8>(), 0..200)) {
+            let _ = Pickle::parse(&bytes);
+        }
+
+        #[test]
+        fn no_program_of_allowed_opcodes_makes_it_panic(mut bytes in program()) {
+            bytes.push(b'.');
+            let _ = Pickle::parse(&bytes);
+        }
+    }
+}

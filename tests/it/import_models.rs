@@ -1,0 +1,367 @@
+//! Imported models are the same functions: they reproduce the reference's numbers, and a set decodes a clip end to end.
+
+use crate::parity::check_parity;
+use crate::released::{self, Small};
+use crate::shared;
+use reviv::decoding::{DecodingSettings, MgetTokens, Sample, Slot, generate};
+use reviv::engine::{Compute, Parameters, Weights};
+use reviv::import::{ImportOptions, import};
+use reviv::masking::PIXELS;
+use reviv::mget::names::to_release;
+use reviv::mget::{Content, Mget, Size};
+use reviv::modality;
+use reviv::source::world::{World, WorldSettings};
+use reviv::tokenizer::trained::VqTokenizer;
+use reviv::tokenizer::{self, TokenGrid, Tokenizer};
+use serde_json::Value;
+use std::path::{Path, PathBuf};
+
+/// A copy of one folder of vectors whose checkpoints are replaced.
+fn copy_of(vectors: &Path, set: &Path, name: &str, replaced: &[(&str, Weights)]) -> PathBuf {
+    let folder = set.join(name);
+    std::fs::create_dir_all(&folder).unwrap();
+    for entry in std::fs::read_dir(vectors.join(name)).unwrap() {
+        let path = entry.unwrap().path();
+        let file = path.file_name().unwrap().to_str().unwrap();
+        if !file.contains("_model.") {
+            std::fs::copy(&path, folder.join(file)).unwrap();
+        }
+    }
+    for (stem, weights) in replaced {
+        let path = folder.join(format!("{stem}_model.safetensors"));
+        weights.write(&path).unwrap();
+    }
+    folder
+}
+
+#[test]
+fn an_imported_transformer_reproduces_every_number_of_the_reference() {
+    let Some(shared) = shared::folder() else {
+        return;
+    };
+    let vectors = shared.join("vectors/parity");
+    let temporary = tempfile::tempdir().unwrap();
+    let mut replaced = Vec::new();
+    for name in ["reviv256", "egom2p"] {
+        let pth = vectors.join(format!("mget/{name}_model.pth"));
+        let folder = temporary.path().join(format!("{name}-imported"));
+        import(&[pth], &folder, &ImportOptions::default()).unwrap();
+        let model = Mget::open(&folder, &Compute::cpu()).unwrap();
+        let mut weights = Weights::default();
+        for (name, tensor) in model.weights().tensors {
+            weights.tensors.insert(to_release(&name), tensor);
+        }
+        replaced.push((name, weights));
+    }
+    let set = temporary.path().join("set");
+    for name in ["mget", "gen"] {
+        let own = if name == "mget" { &replaced[..] } else { &[] };
+        copy_of(&vectors, &set, name, own);
+    }
+    let report = check_parity::check(&set).unwrap();
+    assert!(report.passed(), "{report}");
+}
+
+/// Statistics that change nothing, so that normalised vectors go through.
+fn unit_statistics(folder: &Path, name: &str, shape: &[usize]) -> Vec<PathBuf> {
+    use reviv::formats::npy::{self, NpyArray, NpyData};
+    let count = shape.iter().product();
+    let write = |half: &str, value: f32| {
+        let path = folder.join(format!("{name}_{half}.npy"));
+        let array = NpyArray {
+            shape: shape.to_vec(),
+            data: NpyData::F32(vec![value; count]),
+        };
+        npy::write(&path, &array).unwrap();
+        path
+    };
+    vec![write("mean", 0.0), write("std", 1.0)]
+}
+
+#[test]
+fn imported_signal_tokenizers_reproduce_every_number_of_the_reference() {
+    let Some(shared) = shared::folder() else {
+        return;
+    };
+    let vectors = shared.join("vectors/parity");
+    let temporary = tempfile::tempdir().unwrap();
+    let mut replaced = Vec::new();
+    for (stem, file, modality, heads) in [
+        ("cam", "reviv_tok_cam.pth", "camera", None),
+        ("gaze", "reviv_tok_gaze.pth", "gaze", Some(3)),
+        ("hand", "reviv_tok_rhand.pth", "right_hand", None),
+        ("body", "reviv_tok_body.pth", "body", None),
+    ] {
+        let own = temporary.path().join(stem);
+        std::fs::create_dir(&own).unwrap();
+        let pth = own.join(file);
+        std::fs::copy(vectors.join(format!("vq/{stem}_model.pth")), &pth).unwrap();
+        let mut files = vec![pth];
+        match modality {
+            "gaze" => {}
+            "camera" => files.extend(unit_statistics(&own, "cam", &[9])),
+            "body" => files.extend(unit_statistics(&own, "body", &[21, 3])),
+            _ => files.extend(unit_statistics(&own, "rhand", &[21, 3])),
+        }
+        let folder = own.join("imported");
+        let options = ImportOptions {
+            heads,
+            ..ImportOptions::default()
+        };
+        import(&files, &folder, &options).unwrap();
+        let path = folder.join("tokenizers").join(modality);
+        let opened = tokenizer::open(&path).unwrap();
+        assert_eq!((opened.modality(), opened.vocabulary()), (modality, 64));
+
+        // Through the public door: a clip to the reference's tokens, and these to its clip.
+        let file = Weights::read(&vectors.join(format!("vq/{stem}.safetensors"))).unwrap();
+        let text = std::fs::read_to_string(vectors.join(format!("vq/{stem}.json"))).unwrap();
+        let json: Value = serde_json::from_str(&text).unwrap();
+        codes_and_signals_agree(opened.as_ref(), &file, &json);
+
+        let trained = VqTokenizer::read(&path, modality, &Compute::cpu()).unwrap();
+        replaced.push((stem, trained.model().weights()));
+    }
+    let set = temporary.path().join("set");
+    copy_of(&vectors, &set, "vq", &replaced);
+    let report = check_parity::check(&set).unwrap();
+    assert!(report.passed(), "{report}");
+}
+
+fn codes_and_signals_agree(opened: &dyn Tokenizer, file: &Weights, json: &Value) {
+    use ndarray::{ArrayD, IxDyn};
+    use reviv::clip::Signal;
+    let clip = &file.tensors["clip"];
+    let stored = *clip.shape.last().unwrap();
+    let gaze = opened.modality() == "gaze";
+    let channels = match (opened.modality(), stored) {
+        ("gaze", _) => 2,
+        (_, 4) => 3,
+        _ => stored,
+    };
+    // Gaze comes in [0, 1], the reference's clip in [-1, 1].
+    let raw = |value: f32| if gaze { value * 0.5 + 0.5 } else { value };
+    let mut shape = clip.shape[1..].to_vec();
+    *shape.last_mut().unwrap() = channels;
+    let samples = clip.shape[0];
+    let values = clip.f32("clip").unwrap();
+    let signals: Vec<Signal> = values
+        .chunks_exact(values.len() / samples)
+        .map(|signal| Signal {
+            values: ArrayD::from_shape_vec(
+                IxDyn(&shape),
+                signal
+                    .chunks_exact(stored)
+                    .flat_map(|row| row[..channels].iter().map(|v| raw(*v)))
+                    .collect(),
+            )
+            .unwrap(),
+            valid: (channels < stored).then(|| {
+                let flags = signal.chunks_exact(stored).map(|row| row[channels] != 0.0);
+                let shape = IxDyn(&shape[..shape.len() - 1]);
+                ArrayD::from_shape_vec(shape, flags.collect()).unwrap()
+            }),
+        })
+        .collect();
+    let tokens = opened.encode(&signals).unwrap();
+    let found: Vec<i64> = tokens
+        .iter()
+        .flat_map(|grid| grid.ids.iter().map(|id| i64::from(*id)))
+        .collect();
+    let expected = file.tensors["indices"].i64("indices").unwrap();
+    assert_eq!(found, expected, "{}", opened.modality());
+
+    let back = opened.decode(&tokens).unwrap();
+    let tolerance = json["outputs"]["recon"]["tol"].as_f64().unwrap();
+    let recon = file.tensors["recon"].f32("recon").unwrap();
+    let found: Vec<f64> = back
+        .iter()
+        .flat_map(|signal| signal.values.iter().map(|v| f64::from(*v)))
+        .collect();
+    let (mut off, mut all) = (0.0, 0.0);
+    for (a, b) in found.iter().zip(recon) {
+        let expected = f64::from(*b);
+        let a = if gaze { 2.0 * a - 1.0 } else { *a };
+        off += (a - expected).powi(2);
+        all += expected.powi(2);
+    }
+    let error = (off / all).sqrt();
+    // Gaze is rounded once more on its way to [0, 1] and back.
+    let tolerance = if gaze { tolerance.max(1e-6) } else { tolerance };
+    assert!(error <= tolerance, "{}: {error:.1e}", opened.modality());
+}
+
+#[test]
+fn an_imported_video_tokenizer_reproduces_every_number_of_the_reference() {
+    let Some(shared) = shared::folder() else {
+        return;
+    };
+    let vectors = shared.join("vectors/parity");
+    let temporary = tempfile::tempdir().unwrap();
+    let mut replaced = Vec::new();
+    for stem in ["dv4x8x8", "dv8x16x16"] {
+        let file = vectors.join(format!("cosmos/{stem}_model.safetensors"));
+        let folder = temporary.path().join(stem);
+        import(&[file], &folder, &ImportOptions::default()).unwrap();
+        let opened = tokenizer::open(&folder.join("tokenizers/rgb")).unwrap();
+        assert_eq!(
+            (opened.grid(), opened.vocabulary()),
+            (&[5, 32, 32][..], 64_000)
+        );
+        let depth = tokenizer::open(&folder.join("tokenizers/depth")).unwrap();
+        assert_eq!(depth.modality(), "depth");
+        let path = folder.join("tokenizers/rgb/tokenizer.safetensors");
+        let mut weights = Weights::read(&path).unwrap();
+        weights.metadata.clear();
+        replaced.push((stem, weights));
+    }
+    let set = temporary.path().join("set");
+    let folder = copy_of(&vectors, &set, "cosmos", &replaced);
+    assert!(folder.join("padding.json").is_file());
+    let report = check_parity::check(&set).unwrap();
+    assert!(report.passed(), "{report}");
+}
+
+/// A set of small dimensions that takes clips of 16 x 16 pixels.
+fn small_set(folder: &Path, with_main: bool) {
+    let size = Size {
+        width: 24,
+        heads: 6,
+        encoder_depth: 1,
+        decoder_depth: 1,
+        hidden: 64,
+    };
+    let spec = released::spec(size, [5, 2, 2], [16, 20, 24, 28]);
+    if with_main {
+        let path = folder.join("reviv_main.pth");
+        released::main_model(&path, &spec, "fm_tiny_6e_6d_swiglu_nobias");
+    }
+    let small = Small {
+        width: 24,
+        depth: 1,
+        channels: 4,
+    };
+    released::tokenizers(folder, &spec, small);
+}
+
+#[test]
+fn an_imported_set_decodes_a_clip_end_to_end() {
+    let temporary = tempfile::tempdir().unwrap();
+    let released = temporary.path().join("reviv_500b");
+    std::fs::create_dir(&released).unwrap();
+    small_set(&released, true);
+    let folder = temporary.path().join("model");
+    let files = [released.clone(), released::video(&released)];
+    let report = import(&files, &folder, &ImportOptions::default()).unwrap();
+    assert_eq!(report.notices, Vec::<String>::new());
+    assert_eq!(report.parts.len(), 8);
+    for part in &report.parts {
+        assert!(part.written <= part.entries);
+    }
+
+    let world = World::new(
+        WorldSettings {
+            size: 16,
+            ..WorldSettings::default()
+        },
+        7,
+    );
+    let clip = world.clip(0);
+    let format = world.settings().format();
+    let rgb = modality::built_in("rgb", &format).unwrap();
+    let signal = rgb.extract(&clip).unwrap().unwrap();
+    let model = Mget::open(&folder, &Compute::cpu()).unwrap();
+    let open = |name: &str| tokenizer::open(&folder.join("tokenizers").join(name)).unwrap();
+    let tokens = open("rgb").encode(std::slice::from_ref(&signal)).unwrap();
+    let pixels: Vec<f32> = signal.values.iter().copied().collect();
+    let slots = model
+        .spec()
+        .modalities
+        .iter()
+        .map(|m| match m.name.as_str() {
+            "rgb" => Slot::given(tokens[0].ids.clone()),
+            PIXELS => Slot::Pixels(Content::Floats(&pixels)),
+            _ => Slot::unknown(m.count()),
+        });
+    let sample = Sample {
+        id: 0,
+        slots: slots.collect(),
+    };
+    let targets = ["body", "camera", "depth", "gaze", "left_hand", "right_hand"];
+    let generated = generate(
+        &MgetTokens::new(&model),
+        &DecodingSettings::default(),
+        &[sample],
+        &targets,
+        0,
+    )
+    .unwrap();
+    let mut predicted = reviv::clip::Clip::empty(clip.id.clone(), clip.source.clone());
+    for name in targets {
+        let tokenizer = open(name);
+        let grid = TokenGrid {
+            ids: generated[0].targets[name].ids.clone(),
+            grid: tokenizer.grid().to_vec(),
+        };
+        let signal = tokenizer.decode(&[grid]).unwrap().remove(0);
+        assert!(signal.values.iter().all(|v| v.is_finite()), "{name}");
+        let modality = modality::built_in(name, &format).unwrap();
+        modality.insert(signal, &mut predicted).unwrap();
+    }
+    assert!(predicted.body.is_some() && predicted.camera.is_some() && predicted.depth.is_some());
+}
+
+#[test]
+fn statistics_and_weights_are_one_file_that_names_both() {
+    let temporary = tempfile::tempdir().unwrap();
+    let released = temporary.path().join("set");
+    std::fs::create_dir(&released).unwrap();
+    small_set(&released, false);
+    let folder = temporary.path().join("model");
+    let files = [released.clone(), released::video(&released)];
+    import(&files, &folder, &ImportOptions::default()).unwrap();
+    let text = std::fs::read_to_string(folder.join("manifest.json")).unwrap();
+    let manifest: Value = serde_json::from_str(&text).unwrap();
+    let weights = Weights::read(&folder.join("tokenizers/camera/tokenizer.safetensors")).unwrap();
+    let input = manifest["inputs"].as_array().unwrap().iter();
+    let mut input = input.filter(|input| input["file"] == "reviv_tok_cam.pth");
+    let sha256 = input.next().unwrap()["sha256"].as_str().unwrap();
+    assert_eq!(weights.metadata["weights_sha256"], sha256);
+    let statistics = &manifest["parts"]["camera"]["statistics"]["sha256"];
+    let both: Vec<&str> = statistics
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|s| s.as_str().unwrap())
+        .collect();
+    assert_eq!(weights.metadata["statistics_sha256"], both.join(" "));
+    let mean = weights.tensors["normalise.mean"].f32("mean").unwrap();
+    assert_eq!(mean[3], 0.03);
+
+    // Without its statistics a tokenizer is converted, said to be incomplete, and not opened.
+    let folder = temporary.path().join("bare");
+    let files = [released.join("reviv_tok_cam.pth")];
+    let report = import(&files, &folder, &ImportOptions::default()).unwrap();
+    assert!(report.notices[0].contains("no statistics for `camera`"));
+    let error = tokenizer::open(&folder.join("tokenizers/camera"))
+        .err()
+        .unwrap();
+    assert!(error.to_string().contains("norm_stats"), "{error}");
+    // An encoder alone is no tokenizer; both twice are one.
+    let cosmos = released::video(&released);
+    let folder = temporary.path().join("video");
+    let error = import(
+        &[cosmos.join("encoder.pth")],
+        &folder,
+        &ImportOptions::default(),
+    );
+    assert!(error.unwrap_err().to_string().contains("give the decoder"));
+    let encoder = cosmos.join("encoder-again-dv4x8x8.pth");
+    std::fs::copy(cosmos.join("encoder.pth"), encoder).unwrap();
+    let report = import(&[cosmos], &folder, &ImportOptions::default()).unwrap();
+    let [rgb, depth] = report.parts.as_slice() else {
+        panic!("{report:?}")
+    };
+    assert_eq!((rgb.name.as_str(), depth.name.as_str()), ("rgb", "depth"));
+    assert!(rgb.written < rgb.entries);
+}
