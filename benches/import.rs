@@ -11,14 +11,12 @@ mod released;
 #[allow(dead_code)] // Tests use the rest.
 mod torch;
 
-use reviv::decoding::{DecodingSettings, MgetTokens, Sample, Slot, generate};
+use reviv::decoding::DecodingSettings;
+use reviv::decoding::reconstructor::{Reconstructor, Wish};
 use reviv::engine::Compute;
 use reviv::import::{Checkpoint, ImportOptions, import};
-use reviv::masking::PIXELS;
-use reviv::mget::{Content, Mget, Size};
-use reviv::modality;
+use reviv::mget::Size;
 use reviv::source::world::{World, WorldSettings};
-use reviv::tokenizer::{self, TokenGrid};
 use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -140,46 +138,26 @@ fn child_import(from: &Path, to: &Path) {
     println!("{seconds} {}", kilobytes.unwrap_or(0) * 1024);
 }
 
-/// A clip of the built-in world through the imported model: RGB and raw video in, everything else out.
+/// A clip of the built-in world through the imported model: RGB and raw video in, everything but depth out.
 fn decode(folder: &Path) {
-    let start = Instant::now();
     let world = World::new(WorldSettings::default(), 7);
     let clip = world.clip(0);
-    let format = world.settings().format();
-    let rgb = modality::built_in("rgb", &format).unwrap();
-    let signal = rgb.extract(&clip).unwrap().unwrap();
-    let model = Mget::open(folder, &Compute::cpu()).unwrap();
-    println!("opened in {:.1} s", start.elapsed().as_secs_f64());
     let start = Instant::now();
-    let open = |name: &str| tokenizer::open(&folder.join("tokenizers").join(name)).unwrap();
-    let tokens = open("rgb").encode(std::slice::from_ref(&signal)).unwrap();
-    let pixels: Vec<f32> = signal.values.iter().copied().collect();
-    let slots = model
-        .spec()
-        .modalities
-        .iter()
-        .map(|m| match m.name.as_str() {
-            "rgb" => Slot::given(tokens[0].ids.clone()),
-            PIXELS => Slot::Pixels(Content::Floats(&pixels)),
-            _ => Slot::unknown(m.count()),
-        });
-    let sample = Sample {
-        id: 0,
-        slots: slots.collect(),
+    let model = Reconstructor::open(folder, &Compute::cpu()).unwrap();
+    println!("opened in {:.1} s", start.elapsed().as_secs_f64());
+    let given = ["rgb".to_owned()];
+    let wanted = ["body", "camera", "gaze", "left_hand", "right_hand"].map(str::to_owned);
+    let wish = Wish {
+        given: &given,
+        wanted: &wanted,
+        decoding: &DecodingSettings::default(),
+        seed: 0,
     };
-    let targets = ["body", "camera", "gaze", "left_hand", "right_hand"];
-    let settings = DecodingSettings::default();
-    let tokens = MgetTokens::new(&model);
-    let generated = generate(&tokens, &settings, &[sample], &targets, 0).unwrap();
-    for name in targets {
-        let tokenizer = open(name);
-        let grid = TokenGrid {
-            ids: generated[0].targets[name].ids.clone(),
-            grid: tokenizer.grid().to_vec(),
-        };
-        let signal = tokenizer.decode(&[grid]).unwrap().remove(0);
-        assert!(signal.values.iter().all(|v| v.is_finite()), "{name}");
-        println!("{name}: {:?}", signal.values.shape());
+    let start = Instant::now();
+    let made = model.reconstruct(&[clip], &[0], &wish).unwrap();
+    for (name, confidence) in &made[0].confidence {
+        println!("{name}: {} samples", confidence.len());
     }
-    println!("decoded in {:.1} s", start.elapsed().as_secs_f64());
+    assert!(made[0].clip.body.is_some() && made[0].clip.camera.is_some());
+    println!("decoded a clip in {:.1} s", start.elapsed().as_secs_f64());
 }

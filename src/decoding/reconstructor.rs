@@ -205,7 +205,8 @@ impl Reconstructor {
         let mut tokenizers = BTreeMap::new();
         for slot in &model.spec().modalities {
             let name = &slot.name;
-            if name == PIXELS {
+            // Raw video has no tokens; video of the release's other size is none of these clips'.
+            if slot.vocabulary().is_none() || !modalities.contains_key(name) {
                 continue;
             }
             let path = folder.join(TOKENIZERS).join(name);
@@ -354,9 +355,9 @@ impl Reconstructor {
     fn slots<'a>(&self, seen: &'a Seen<'_>, clip: usize) -> Vec<Slot<'a>> {
         let of = |slot: &ModalitySpec| match seen.tokens.get(slot.name.as_str()) {
             Some(grids) => Slot::given(grids[clip].ids.clone()),
-            None if slot.name == PIXELS => Slot::Pixels(match seen.pixels.get(clip) {
-                Some(values) => Content::Floats(values),
-                None => Content::Absent,
+            None if slot.vocabulary().is_none() => Slot::Pixels(match seen.pixels.get(clip) {
+                Some(values) if slot.name == PIXELS => Content::Floats(values),
+                _ => Content::Absent,
             }),
             None => Slot::unknown(slot.count()),
         };

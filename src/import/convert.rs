@@ -6,6 +6,7 @@ use super::hash::Hashes;
 use super::part::Part;
 use super::source::{Source, expand};
 use super::statistics::{self, Statistics};
+use crate::decoding::reconstructor::Binding;
 use crate::mget::MgetSpec;
 use serde_json::{Map, Value, json};
 use std::collections::BTreeMap;
@@ -47,7 +48,7 @@ pub struct PartReport {
 const FORMAT: u64 = 2;
 
 /// Imports released files (weights, statistics, or folders of them) into `folder`, which must not exist yet: a model that
-/// [`crate::mget::Mget::open`] and [`crate::tokenizer::open`] read, and a `manifest.json` that accounts for every entry.
+/// [`crate::decoding::Reconstructor`] opens, and a `manifest.json` that accounts for every entry.
 ///
 /// # Errors
 /// When a file is not what it seems, an entry is unknown, or something that would be dropped is not redundant. Nothing is left
@@ -85,6 +86,8 @@ pub fn import(
 /// Everything that was given, recognised and checked, by part.
 struct Set {
     parts: BTreeMap<String, Part>,
+    /// The transformer, once it is known.
+    spec: Option<MgetSpec>,
     hashes: Hashes,
     notices: Vec<String>,
 }
@@ -126,6 +129,7 @@ impl Set {
         }
         let set = Self {
             parts,
+            spec: None,
             hashes,
             notices,
         };
@@ -139,11 +143,10 @@ impl Set {
         options: &ImportOptions,
     ) -> Result<Vec<Planned>, ImportError> {
         let mut models: Vec<Planned> = Vec::new();
-        let mut spec: Option<MgetSpec> = None;
         if let Some(part) = self.parts.get("mget") {
             let (model, found) = folder::transformer(part)?;
             models.push(("mget".to_owned(), model));
-            spec = Some(found);
+            self.spec = Some(found);
             let builder = part.first().checkpoint.arguments().get("model");
             let egom2p = builder
                 .and_then(Value::as_str)
@@ -167,7 +170,7 @@ impl Set {
                     models.push((name.clone(), folder::signals(part, own)?));
                 }
                 "cosmos" => {
-                    let all = folder::video(part, spec.as_ref(), options.clip)?;
+                    let all = folder::video(part, self.spec.as_ref(), options.clip)?;
                     models.extend(all.into_iter().map(|model| (name.clone(), model)));
                 }
                 _ => {}
@@ -177,8 +180,8 @@ impl Set {
             let notice = format!("statistics of `{modality}` without its tokenizer: left out");
             self.notices.push(notice);
         }
-        if let Some(spec) = &spec {
-            self.compare_vocabularies(spec, &models)?;
+        if let Some(spec) = self.spec.clone() {
+            self.compare_vocabularies(&spec, &models)?;
         }
         Ok(models)
     }
@@ -255,6 +258,12 @@ impl Set {
                 written: part.tensors.len(),
                 values,
             });
+        }
+        if let Some(spec) = &self.spec {
+            let clips = folder::clips(spec, models.iter().map(|(_, model)| model));
+            Binding::of(work, clips)
+                .and_then(|binding| binding.write(work))
+                .map_err(|e| ImportError::refused(work, e.to_string()))?;
         }
         let mut inputs = Vec::new();
         for source in self.parts.values().flat_map(|part| &part.sources) {

@@ -4,16 +4,19 @@
 //! ```text
 //! DIR/mget.json  weights.safetensors               the transformer
 //! DIR/tokenizers/camera/tokenizer.safetensors      weights and statistics of one modality, in one file
+//! DIR/model.json                                   which clips it takes, and which tokenizers belong to it
 //! DIR/manifest.json                                every input with its SHA-256, every entry with what became of it
 //! ```
 
 use super::ImportError;
 use super::part::{Part, Tensor, Values};
 use super::statistics::Statistics;
+use crate::clip::clock;
 use crate::engine::{Compute, Initialise, Parameters};
+use crate::masking::PIXELS;
 use crate::mget::stored::{SPEC, WEIGHTS};
-use crate::mget::{MgetSpec, ModalitySpec};
-use crate::modality::Shape;
+use crate::mget::{Input, MgetSpec, ModalitySpec};
+use crate::modality::{ClipFormat, Shape};
 use crate::tokenizer::trained::{DEVIATION, FILE, MEAN, VqTokenizer};
 use crate::tokenizer::video::{Network, VideoSettings, VideoTokenizer};
 use crate::tokenizer::vq::{VqSettings, VqVae};
@@ -33,6 +36,8 @@ pub(super) struct Model {
     pub beside: Option<(&'static str, Vec<u8>)>,
     pub settings: Value,
     pub statistics: Option<Statistics>,
+    /// Frames, height and width that a video tokenizer takes.
+    pub clip: Option<[usize; 3]>,
 }
 
 impl Model {
@@ -47,7 +52,35 @@ impl Model {
             beside: None,
             settings,
             statistics: None,
+            clip: None,
         }
+    }
+}
+
+/// The clips of a set: of the size that its tokenizer of RGB takes, else that of its raw video, else the paper's.
+pub(super) fn clips<'a>(
+    spec: &MgetSpec,
+    mut models: impl Iterator<Item = &'a Model>,
+) -> ClipFormat {
+    let rgb = models.find(|model| model.name == "rgb");
+    let pixels = spec
+        .modalities
+        .iter()
+        .find_map(|modality| match modality.input {
+            Input::Pixels { clip, .. } if modality.name == PIXELS => {
+                Some([clip[0], clip[1], clip[2]])
+            }
+            _ => None,
+        });
+    let format = ClipFormat::default();
+    match rgb.and_then(|model| model.clip).or(pixels) {
+        Some([frames, size, _]) => ClipFormat {
+            frames,
+            size,
+            video_rate: frames as f64 / clock::CLIP_SECONDS,
+            ..format
+        },
+        None => format,
     }
 }
 
@@ -68,6 +101,7 @@ pub(super) fn transformer(part: &Part) -> Result<(Model, MgetSpec), ImportError>
         beside: Some((SPEC, text)),
         settings: source.plan.settings.clone(),
         statistics: None,
+        clip: None,
     };
     Ok((model, spec))
 }
@@ -170,7 +204,10 @@ pub(super) fn video(
     }
     let model = |(modality, clip): (String, [usize; 3])| {
         let metadata = VideoTokenizer::describe(&modality, clip, &settings);
-        Model::tokenizer(&modality, metadata, source.plan.settings.clone())
+        Model {
+            clip: Some(clip),
+            ..Model::tokenizer(&modality, metadata, source.plan.settings.clone())
+        }
     };
     Ok(wanted.into_iter().map(model).collect())
 }

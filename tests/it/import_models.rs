@@ -3,16 +3,17 @@
 use crate::parity::check_parity;
 use crate::released::{self, Small};
 use crate::shared;
-use reviv::decoding::{DecodingSettings, MgetTokens, Sample, Slot, generate};
+use ndarray::Array3;
+use reviv::decoding::DecodingSettings;
+use reviv::decoding::reconstructor::{Reconstructor, Wish};
 use reviv::engine::{Compute, Parameters, Weights};
+use reviv::formats::png::{self, Picture};
 use reviv::import::{ImportOptions, import};
-use reviv::masking::PIXELS;
 use reviv::mget::names::to_release;
-use reviv::mget::{Content, Mget, Size};
-use reviv::modality;
+use reviv::mget::{Mget, Size};
 use reviv::source::world::{World, WorldSettings};
 use reviv::tokenizer::trained::VqTokenizer;
-use reviv::tokenizer::{self, TokenGrid, Tokenizer};
+use reviv::tokenizer::{self, Tokenizer};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 
@@ -259,56 +260,86 @@ fn an_imported_set_decodes_a_clip_end_to_end() {
         assert!(part.written <= part.entries);
     }
 
-    let world = World::new(
-        WorldSettings {
-            size: 16,
-            ..WorldSettings::default()
-        },
-        7,
-    );
-    let clip = world.clip(0);
-    let format = world.settings().format();
-    let rgb = modality::built_in("rgb", &format).unwrap();
-    let signal = rgb.extract(&clip).unwrap().unwrap();
-    let model = Mget::open(&folder, &Compute::cpu()).unwrap();
-    let open = |name: &str| tokenizer::open(&folder.join("tokenizers").join(name)).unwrap();
-    let tokens = open("rgb").encode(std::slice::from_ref(&signal)).unwrap();
-    let pixels: Vec<f32> = signal.values.iter().copied().collect();
-    let slots = model
-        .spec()
-        .modalities
-        .iter()
-        .map(|m| match m.name.as_str() {
-            "rgb" => Slot::given(tokens[0].ids.clone()),
-            PIXELS => Slot::Pixels(Content::Floats(&pixels)),
-            _ => Slot::unknown(m.count()),
-        });
-    let sample = Sample {
-        id: 0,
-        slots: slots.collect(),
+    let settings = WorldSettings {
+        size: 16,
+        ..WorldSettings::default()
     };
-    let targets = ["body", "camera", "depth", "gaze", "left_hand", "right_hand"];
-    let generated = generate(
-        &MgetTokens::new(&model),
-        &DecodingSettings::default(),
-        &[sample],
-        &targets,
-        0,
+    let world = World::new(settings, 7);
+    let model = Reconstructor::open(&folder, &Compute::cpu()).unwrap();
+    assert_eq!(*model.format(), world.settings().format());
+    let given = ["rgb".to_owned()];
+    let wanted = ["body", "camera", "depth", "gaze", "left_hand", "right_hand"].map(str::to_owned);
+    let wish = Wish {
+        given: &given,
+        wanted: &wanted,
+        decoding: &DecodingSettings::default(),
+        seed: 0,
+    };
+    let clips = [world.clip(0), world.clip(1)];
+    let made = model.reconstruct(&clips, &[0, 1], &wish).unwrap();
+    for one in &made {
+        let clip = &one.clip;
+        assert!(clip.camera.is_some() && clip.depth.is_some() && clip.gaze.is_some());
+        assert!(clip.body.is_some() && clip.left_hand.is_some() && clip.right_hand.is_some());
+        assert_eq!(one.confidence["camera"].len(), 60);
+    }
+
+    // Another tokenizer in its place is noticed.
+    let other = folder.join("tokenizers/left_hand/tokenizer.safetensors");
+    std::fs::copy(
+        folder.join("tokenizers/right_hand/tokenizer.safetensors"),
+        other,
     )
     .unwrap();
-    let mut predicted = reviv::clip::Clip::empty(clip.id.clone(), clip.source.clone());
-    for name in targets {
-        let tokenizer = open(name);
-        let grid = TokenGrid {
-            ids: generated[0].targets[name].ids.clone(),
-            grid: tokenizer.grid().to_vec(),
-        };
-        let signal = tokenizer.decode(&[grid]).unwrap().remove(0);
-        assert!(signal.values.iter().all(|v| v.is_finite()), "{name}");
-        let modality = modality::built_in(name, &format).unwrap();
-        modality.insert(signal, &mut predicted).unwrap();
+    let error = Reconstructor::open(&folder, &Compute::cpu()).err().unwrap();
+    assert!(error.to_string().contains("left_hand"), "{error}");
+}
+
+#[test]
+fn reconstruct_takes_an_imported_model() {
+    let temporary = tempfile::tempdir().unwrap();
+    let released = temporary.path().join("reviv_500b");
+    std::fs::create_dir(&released).unwrap();
+    small_set(&released, true);
+    let run = |arguments: &[&std::ffi::OsStr]| {
+        let output = std::process::Command::new(env!("CARGO_BIN_EXE_reviv"))
+            .current_dir(temporary.path())
+            .args(arguments)
+            .output()
+            .unwrap();
+        let error = String::from_utf8_lossy(&output.stderr).into_owned();
+        assert!(output.status.success(), "{error}");
+        error
+    };
+    let video = released::video(&released);
+    run(&[
+        "import".as_ref(),
+        released.as_ref(),
+        video.as_ref(),
+        "-o".as_ref(),
+        "model".as_ref(),
+    ]);
+    let frames = temporary.path().join("walk");
+    std::fs::create_dir(&frames).unwrap();
+    for k in 0..70_usize {
+        let pixels = Array3::from_shape_fn((24, 24, 3), |(y, x, c)| {
+            ((y * 7 + x * 3 + c + k * 5) % 251) as u8
+        });
+        let path = frames.join(format!("{k:04}.png"));
+        png::write(&path, &Picture::Rgb8(pixels)).unwrap();
     }
-    assert!(predicted.body.is_some() && predicted.camera.is_some() && predicted.depth.is_some());
+    run(&[
+        "reconstruct".as_ref(),
+        "walk".as_ref(),
+        "--model".as_ref(),
+        "model".as_ref(),
+        "-o".as_ref(),
+        "result".as_ref(),
+    ]);
+    let result = temporary.path().join("result");
+    for file in ["manifest.json", "camera.tum", "gaze.csv", "body.npz"] {
+        assert!(result.join(file).is_file(), "{file}");
+    }
 }
 
 #[test]
