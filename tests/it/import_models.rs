@@ -3,11 +3,9 @@
 use crate::parity::check_parity;
 use crate::released::{self, Small};
 use crate::shared;
-use ndarray::Array3;
 use reviv::decoding::DecodingSettings;
 use reviv::decoding::reconstructor::{Reconstructor, Wish};
 use reviv::engine::{Compute, Parameters, Weights};
-use reviv::formats::png::{self, Picture};
 use reviv::import::{ImportOptions, import};
 use reviv::mget::names::to_release;
 use reviv::mget::{Mget, Size};
@@ -293,53 +291,6 @@ fn an_imported_set_decodes_a_clip_end_to_end() {
     .unwrap();
     let error = Reconstructor::open(&folder, &Compute::cpu()).err().unwrap();
     assert!(error.to_string().contains("left_hand"), "{error}");
-}
-
-#[test]
-fn reconstruct_takes_an_imported_model() {
-    let temporary = tempfile::tempdir().unwrap();
-    let released = temporary.path().join("reviv_500b");
-    std::fs::create_dir(&released).unwrap();
-    small_set(&released, true);
-    let run = |arguments: &[&std::ffi::OsStr]| {
-        let output = std::process::Command::new(env!("CARGO_BIN_EXE_reviv"))
-            .current_dir(temporary.path())
-            .args(arguments)
-            .output()
-            .unwrap();
-        let error = String::from_utf8_lossy(&output.stderr).into_owned();
-        assert!(output.status.success(), "{error}");
-        error
-    };
-    let video = released::video(&released);
-    run(&[
-        "import".as_ref(),
-        released.as_ref(),
-        video.as_ref(),
-        "-o".as_ref(),
-        "model".as_ref(),
-    ]);
-    let frames = temporary.path().join("walk");
-    std::fs::create_dir(&frames).unwrap();
-    for k in 0..70_usize {
-        let pixels = Array3::from_shape_fn((24, 24, 3), |(y, x, c)| {
-            ((y * 7 + x * 3 + c + k * 5) % 251) as u8
-        });
-        let path = frames.join(format!("{k:04}.png"));
-        png::write(&path, &Picture::Rgb8(pixels)).unwrap();
-    }
-    run(&[
-        "reconstruct".as_ref(),
-        "walk".as_ref(),
-        "--model".as_ref(),
-        "model".as_ref(),
-        "-o".as_ref(),
-        "result".as_ref(),
-    ]);
-    let result = temporary.path().join("result");
-    for file in ["manifest.json", "camera.tum", "gaze.csv", "body.npz"] {
-        assert!(result.join(file).is_file(), "{file}");
-    }
 }
 
 #[test]
