@@ -6,6 +6,7 @@
 mod check;
 mod compare;
 mod completions;
+mod data;
 mod gc;
 mod import;
 mod list;
@@ -65,6 +66,7 @@ commands! {
     verify::Verify,
     gc::Gc,
     import::Import,
+    data::Data,
     schema::Schema,
     completions::Completions,
 }

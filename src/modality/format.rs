@@ -1,6 +1,8 @@
 //! The sizes that all clips of one artifact share; every modality's shape follows from it.
 
 use super::DeclaredSettings;
+use super::declared::{Normalize, SignalSettings, SignalSource};
+use crate::clip::Clip;
 use crate::clip::clock;
 use crate::clip::depth_video::DepthCoding;
 use schemars::JsonSchema;
@@ -38,5 +40,47 @@ impl Default for ClipFormat {
             depth: DepthCoding::relative(),
             declared: Vec::new(),
         }
+    }
+}
+
+impl ClipFormat {
+    /// What a clip shows of the format it was made in; the rest is the paper's. Declared modalities get numbers as channel names.
+    pub fn of(clip: &Clip) -> Self {
+        let mut format = Self::default();
+        let video = clip
+            .rgb
+            .as_ref()
+            .map(|rgb| (rgb.rate, [rgb.frames.shape()[0], rgb.frames.shape()[1]]))
+            .or_else(|| {
+                let depth = clip.depth.as_ref()?;
+                Some((
+                    depth.rate,
+                    [depth.metres.shape()[0], depth.metres.shape()[1]],
+                ))
+            });
+        if let Some((rate, [frames, size])) = video {
+            (format.video_rate, format.frames, format.size) = (rate, frames, size);
+        }
+        for (name, signal) in &clip.declared {
+            let &[samples, channels] = signal.values.shape() else {
+                continue;
+            };
+            format.declared.push(DeclaredSettings {
+                name: name.clone(),
+                about: String::new(),
+                signal: SignalSettings {
+                    rate: samples as f64 / clock::CLIP_SECONDS,
+                    channels: (0..channels).map(|channel| channel.to_string()).collect(),
+                    units: vec!["?".to_owned()],
+                    frame: String::new(),
+                    missing: crate::modality::declared::Missing::Nan,
+                },
+                normalize: Normalize::default(),
+                tokenizer: None,
+                source: SignalSource::default(),
+                metrics: Vec::new(),
+            });
+        }
+        format
     }
 }

@@ -43,7 +43,7 @@ impl Counter {
     pub fn new(format: &ClipFormat) -> Self {
         Self {
             format: format.clone(),
-            inventory: empty(&all(format)),
+            inventory: Inventory::of(format),
         }
     }
 
@@ -65,6 +65,11 @@ impl Counter {
 }
 
 impl Inventory {
+    /// Of no clips of this format.
+    pub fn of(format: &ClipFormat) -> Self {
+        empty(&all(format))
+    }
+
     /// Adds an inventory of the same modalities.
     pub fn merge(&mut self, other: &Inventory) {
         self.clips += other.clips;
@@ -93,7 +98,8 @@ fn empty(modalities: &[Box<dyn Modality>]) -> Inventory {
     }
 }
 
-fn count(clip: &Clip, format: &ClipFormat) -> Inventory {
+/// The inventory of one clip.
+pub fn count(clip: &Clip, format: &ClipFormat) -> Inventory {
     let modalities = all(format);
     let mut inventory = empty(&modalities);
     inventory.clips = 1;

@@ -1,35 +1,62 @@
-//! `op: clips`: makes clips by split and stores them in shards.
+//! `op: clips`: makes clips by split and stores them in shards, from the built-in world or from recordings.
 //!
 //! `<split>/<modality>/<data set>/shard-000000.tar`, see [`crate::clip::store`]. A shard that is complete survives an
-//! interruption. Clip `i` of a split is the same whatever the other numbers are.
+//! interruption. Clip `i` of a split of the world is the same whatever the other numbers are.
 
-use crate::clip::shard::ShardError;
-use crate::clip::{Clip, depth_video::DepthCoding, store};
+use crate::clip::depth_video::DepthCoding;
 use crate::experiment::artifact::{ArtifactKind, Description, SignalFacts};
 use crate::experiment::context::{StageContext, StageError};
 use crate::experiment::entry::{Entry, Kind, KindEntry};
 use crate::experiment::problem::{Code, Problem};
 use crate::experiment::stage::{Inputs, Op, OpEntry, Port, StagePlan};
 use crate::modality::{self, ClipFormat, DeclaredSettings, Modality, Shape};
+use crate::source::convert::{ConvertSettings, convert};
+use crate::source::open::{Dataset, open};
+use crate::source::recording::CutSettings;
+use crate::source::shards::TarSink;
+use crate::source::split::{Chosen, SplitSettings, divide};
+use crate::source::world::clips::{SENSORS, WorldClips, sensor_of};
 use crate::source::world::{World, WorldSettings};
-use rayon::prelude::*;
+use crate::source::{Source, SourceError};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
+use std::ops::ControlFlow;
 use std::path::Path;
+use std::sync::Arc;
 
 /// Where clips come from: a registry entry of kind `source`.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct SourceSettings {
-    /// The built-in synthetic world.
+    /// The built-in synthetic world, where no `data` is named.
     pub world: WorldSettings,
+    /// A data set of `data.yaml` instead of the world: recordings, videos, or clips that were converted before.
+    pub data: Option<String>,
+    /// What lies there; left out: what it looks like.
+    pub dataset: Option<Dataset>,
+    /// How clips are cut from recordings.
+    pub cut: CutSettings,
+    /// Which recordings are for training, which for validation and which for the test.
+    pub split: SplitSettings,
+    /// Leave out clips whose files are damaged instead of stopping at the first one.
+    pub skip_damaged: bool,
+}
+
+impl SourceSettings {
+    /// The sizes of the clips.
+    pub fn format(&self) -> ClipFormat {
+        match self.data {
+            Some(_) => self.cut.format(),
+            None => self.world.format(),
+        }
+    }
 }
 
 impl Kind for SourceSettings {
     const KIND: &'static str = "source";
-    const ABOUT: &'static str = "Where clips come from: the built-in world.";
+    const ABOUT: &'static str = "Where clips come from: the built-in world, or recordings.";
 }
 
 impl Kind for DeclaredSettings {
@@ -46,7 +73,7 @@ inventory::submit! { KindEntry::of::<DeclaredSettings>() }
 pub struct ClipsSettings {
     /// Where the clips come from.
     pub source: Entry<SourceSettings>,
-    /// Clips to train on.
+    /// Clips to train on; from recordings at most so many.
     #[serde(default)]
     pub train: u64,
     /// Clips to watch training with.
@@ -70,8 +97,8 @@ const SPLITS: [(&str, u64); 3] = [
     ("test", 2_000_000_000),
 ];
 
-/// Sensors of the built-in world that a declared modality can be fed from.
-const WORLD_SENSORS: [&str; 1] = ["head_imu"];
+/// Where the markers of finished shards are while a stage runs.
+const MARKERS: &str = ".finished";
 
 impl ClipsSettings {
     fn count(&self, split: &str) -> u64 {
@@ -99,15 +126,14 @@ impl ClipsSettings {
         ClipFormat {
             depth: self.depth,
             declared: declared.collect(),
-            ..self.source.settings.world.format()
+            ..self.source.settings.format()
         }
     }
 
     /// Bytes of one clip on disk.
     fn clip_bytes(&self) -> u64 {
-        let world = &self.source.settings.world;
-        let pixels = u64::from(world.size).pow(2) * world.frames as u64;
-        pixels * 7 + 80_000
+        let format = self.source.settings.format();
+        (format.size * format.size * format.frames * 7) as u64 + 80_000
     }
 
     /// Shards of about 64 MB.
@@ -142,7 +168,7 @@ impl Op for Clips {
     }
 
     fn version(&self) -> u32 {
-        1
+        2
     }
 
     fn about(&self) -> &'static str {
@@ -157,13 +183,32 @@ impl Op for Clips {
         ArtifactKind::Clips
     }
 
+    fn data(&self, settings: &ClipsSettings) -> Vec<(String, String)> {
+        let data = settings.source.settings.data.clone();
+        data.map(|name| (name, "source.data".to_owned()))
+            .into_iter()
+            .collect()
+    }
+
     fn check(
         &self,
         settings: &ClipsSettings,
         _inputs: &Inputs<'_>,
         problems: &mut Vec<Problem>,
     ) -> Description {
-        if let Some((key, reason)) = settings.source.settings.world.problem() {
+        let source = &settings.source.settings;
+        if source.data.is_some() {
+            if let Err(error) = source.cut.check() {
+                problems.push(Problem::new(Code::E0202, "source.cut", error.to_string()));
+            }
+            if let Some((key, reason)) = source.split.problem() {
+                problems.push(Problem::new(
+                    Code::E0202,
+                    format!("source.split.{key}"),
+                    reason,
+                ));
+            }
+        } else if let Some((key, reason)) = source.world.problem() {
             problems.push(Problem::new(
                 Code::E0202,
                 format!("source.world.{key}"),
@@ -181,13 +226,20 @@ impl Op for Clips {
                     reason,
                 ));
             }
+            if source.data.is_some() {
+                if entry.settings.source.npz.is_none() {
+                    let message = format!("`{}` does not say where recordings have it", entry.name);
+                    problems.push(
+                        Problem::new(Code::E0204, format!("declared.{i}"), message)
+                            .help("`source: {npz: FILE, key: ARRAY}`, a file of each recording"),
+                    );
+                }
+                continue;
+            }
             let sensor = sensor_of(&entry.name, &entry.settings);
-            if !WORLD_SENSORS.contains(&sensor) {
+            if !SENSORS.contains(&sensor) {
                 let message = format!("the built-in world has no sensor `{sensor}`");
-                let help = format!(
-                    "it has {}",
-                    WORLD_SENSORS.map(|s| format!("`{s}`")).join(", ")
-                );
+                let help = format!("it has {}", SENSORS.map(|s| format!("`{s}`")).join(", "));
                 problems
                     .push(Problem::new(Code::E0203, format!("declared.{i}"), message).help(help));
             }
@@ -237,120 +289,144 @@ impl Op for Clips {
         settings: &ClipsSettings,
         context: &mut dyn StageContext,
     ) -> Result<Value, StageError> {
-        let world = World::new(settings.source.settings.world.clone(), context.seed());
-        let total: u64 = settings.splits().map(|(_, _, count)| count).sum();
         let format = settings.format();
+        let parts = parts(settings, &format, context)?;
+        let total: u64 = parts.iter().map(|(_, source)| source.len() as u64).sum();
+        let how = ConvertSettings {
+            clips_per_shard: settings.clips_per_shard() as usize,
+            skip_damaged: settings.source.settings.skip_damaged,
+        };
         let mut done = 0;
         let mut splits = serde_json::Map::new();
-        for (split, first, count) in settings.splits() {
+        let mut name = "world".to_owned();
+        for (split, source) in &parts {
+            source.name().clone_into(&mut name);
             let folder = context.checkpoints().join("clips").join(split);
-            std::fs::create_dir_all(&folder).map_err(StageError::io(&folder))?;
-            let per_shard = settings.clips_per_shard();
-            let shards = count.div_ceil(per_shard);
-            for shard in 0..shards {
-                let from = shard * per_shard;
-                let to = (from + per_shard).min(count);
-                let marker = folder.join(format!("shard-{shard:06}.done"));
-                if !marker.exists() {
-                    let clips = Generation {
-                        world: &world,
-                        format: &format,
-                        context: &mut *context,
-                        next: first + from,
-                        end: first + to,
-                        ready: Vec::new().into_iter(),
-                        done,
-                        total,
-                    };
-                    store::write_clips(&folder, shard as u32, clips)
-                        .map_err(|Failure(error)| error)?;
-                    std::fs::write(&marker, b"").map_err(StageError::io(&marker))?;
+            let sink = TarSink::new(&folder, &folder.join(MARKERS)).map_err(refused)?;
+            let converted = convert(source.as_ref(), &sink, &how, &mut |progress| {
+                context.progress(done + progress.done as u64, total, "clips");
+                if context.interrupted() {
+                    return ControlFlow::Break(());
                 }
-                done += to - from;
-                context.progress(done, total, "clips");
+                ControlFlow::Continue(())
+            })
+            .map_err(refused)?;
+            if converted.interrupted {
+                return Err(StageError::Interrupted);
+            }
+            done += source.len() as u64;
+            let tally = converted.tally;
+            for (reason, count) in &tally.dropped {
+                context.log(&format!("{split}: {count} clips dropped: {reason}"));
+            }
+            for error in &tally.damaged {
+                context.log(&format!("{split}: left out: {error}"));
+            }
+            if tally.clips == 0 {
+                return Err(StageError::Input {
+                    code: Code::E0601,
+                    message: format!("not one clip for `{split}`"),
+                    help: "`reviv data inspect` shows what is there and why clips are dropped"
+                        .to_owned(),
+                });
             }
             splits.insert(
-                split.to_owned(),
-                json!({ "clips": count, "shards": shards }),
+                (*split).to_owned(),
+                json!({
+                    "clips": tally.clips, "shards": converted.shards, "dropped": tally.dropped,
+                    "damaged": tally.damaged,
+                }),
             );
         }
         for (split, _, _) in settings.splits() {
             let folder = context.checkpoints().join("clips").join(split);
             deliver(&folder, &context.output().join(split))?;
         }
-        Ok(json!({ "source": "world", "format": format, "splits": splits }))
+        Ok(json!({ "source": name, "format": format, "splits": splits }))
     }
 }
 
-fn sensor_of<'a>(name: &'a str, settings: &'a DeclaredSettings) -> &'a str {
-    settings.source.world.as_deref().unwrap_or(name)
-}
-
-/// A [`StageError`] that shard errors turn into.
-struct Failure(StageError);
-
-impl From<ShardError> for Failure {
-    fn from(error: ShardError) -> Self {
-        Self(StageError::other(error))
-    }
-}
-
-/// Clips made a few at a time on all cores, handed out in order: memory does not grow with their number.
-struct Generation<'a> {
-    world: &'a World,
-    format: &'a ClipFormat,
-    context: &'a mut dyn StageContext,
-    next: u64,
-    end: u64,
-    ready: std::vec::IntoIter<Clip>,
-    done: u64,
-    total: u64,
-}
-
-impl Iterator for Generation<'_> {
-    type Item = Result<Clip, Failure>;
-
-    fn next(&mut self) -> Option<Self::Item> {
-        if let Some(clip) = self.ready.next() {
-            return Some(Ok(clip));
-        }
-        if self.next >= self.end {
-            return None;
-        }
-        if self.context.interrupted() {
-            self.next = self.end;
-            return Some(Err(Failure(StageError::Interrupted)));
-        }
-        let batch = (2 * rayon::current_num_threads() as u64).min(self.end - self.next);
-        let clips: Vec<Clip> = (0..batch as usize)
-            .into_par_iter()
-            .map(|i| self.world.clip(self.next + i as u64))
-            .map(|clip| keep_declared(clip, self.format))
-            .collect();
-        self.next += batch;
-        self.done += batch;
-        self.context.progress(self.done, self.total, "clips");
-        self.ready = clips.into_iter();
-        self.ready.next().map(Ok)
-    }
-}
-
-/// Gives each declared modality the world's sensor it asks for.
-fn keep_declared(mut clip: Clip, format: &ClipFormat) -> Clip {
-    let sensors = std::mem::take(&mut clip.declared);
-    for declared in &format.declared {
-        if let Some(signal) = sensors.get(sensor_of(&declared.name, declared)) {
-            clip.declared.insert(declared.name.clone(), signal.clone());
+/// The clips of each split, in the order they are stored.
+fn parts(
+    settings: &ClipsSettings,
+    format: &ClipFormat,
+    context: &dyn StageContext,
+) -> Result<Vec<(&'static str, Arc<dyn Source>)>, StageError> {
+    let from = &settings.source.settings;
+    let Some(data) = &from.data else {
+        let world = World::new(from.world.clone(), context.seed());
+        let part = |(split, first, count): (&'static str, u64, u64)| {
+            let clips = WorldClips::new(world.clone(), first..first + count);
+            let source: Arc<dyn Source> = Arc::new(clips.with_declared(&format.declared));
+            (split, source)
+        };
+        return Ok(settings.splits().map(part).collect());
+    };
+    let root = context.data_root(data).ok_or_else(|| StageError::Input {
+        code: Code::E0601,
+        message: format!("data set `{data}` is not configured"),
+        help: "add it to `data.yaml`".to_owned(),
+    })?;
+    let source = open(root, from.dataset, &from.cut, &format.declared).map_err(refused)?;
+    if let Some(there) = source.format() {
+        let size = |format: &ClipFormat| (format.frames, format.size, format.video_rate.to_bits());
+        if size(&there) != size(format) {
+            return Err(StageError::Input {
+                code: Code::E0401,
+                message: format!(
+                    "`{data}` holds clips of {} frames of {} pixels at {} Hz",
+                    there.frames, there.size, there.video_rate
+                ),
+                help: "make `cut: {fps, side}` say the same, or convert the recordings again"
+                    .to_owned(),
+            });
         }
     }
-    clip
+    let asked: Vec<(&'static str, u64)> = settings
+        .splits()
+        .map(|(split, _, count)| (split, count))
+        .collect();
+    let divided = divide(source.as_ref(), &from.split, &asked).map_err(refused)?;
+    let mut parts: Vec<(&'static str, Arc<dyn Source>)> = Vec::new();
+    for (split, clips) in divided {
+        if clips.is_empty() {
+            return Err(StageError::Input {
+                code: Code::E0601,
+                message: format!(
+                    "no recording for `{split}`: {} recordings, {} clips in all",
+                    source.recordings().len(),
+                    source.len()
+                ),
+                help: format!(
+                    "name some in `split: {{{split}_recordings: [...]}}`, or ask for fewer splits"
+                ),
+            });
+        }
+        parts.push((split, Arc::new(Chosen::new(Arc::clone(&source), clips))));
+    }
+    Ok(parts)
+}
+
+/// What is wrong with recordings is for the user to mend, what is wrong with the disk is not.
+fn refused(error: SourceError) -> StageError {
+    match error {
+        SourceError::Io { path, cause } => StageError::Io {
+            path: path.display().to_string(),
+            error: cause,
+        },
+        error => StageError::Input {
+            code: Code::E0601,
+            message: error.to_string(),
+            help: "`reviv data inspect` shows what can be read".to_owned(),
+        },
+    }
 }
 
 /// Moves finished shards to where the artifact is written.
 fn deliver(from: &Path, to: &Path) -> Result<(), StageError> {
     for entry in std::fs::read_dir(from).map_err(StageError::io(from))? {
         let path = entry.map_err(StageError::io(from))?.path();
-        if path.extension().is_some_and(|e| e == "done") {
+        if path.file_name().is_some_and(|name| name == MARKERS) {
             continue;
         }
         std::fs::create_dir_all(to).map_err(StageError::io(to))?;

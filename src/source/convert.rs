@@ -1,14 +1,14 @@
-//! A source into shards: in parallel, resumable, and with memory that depends on the number of threads only.
+//! A source into shards: clips are made on all cores, resumable, and with memory that depends on the number of threads only.
 //!
 //! Clips are grouped by index, so that a shard's content does not depend on how many threads work or on where an earlier attempt
 //! stopped. A shard that is there is not made again. How shards lie on disk is the [`ShardSink`]'s affair.
 
+use super::pipeline::in_order;
 use super::{DropReason, Outcome, Source, SourceError};
 use crate::clip::Clip;
-use rayon::prelude::*;
+use std::cell::RefCell;
 use std::collections::BTreeMap;
-use std::sync::Mutex;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::ops::ControlFlow;
 
 /// How to convert.
 #[derive(
@@ -32,7 +32,7 @@ impl Default for ConvertSettings {
 }
 
 /// Where shards go.
-pub trait ShardSink: Sync {
+pub trait ShardSink {
     /// What a finished shard of an earlier attempt holds; `None` when it has to be made.
     fn finished(&self, shard: usize) -> Option<Tally>;
     /// Writes one shard from its clips, so that it is there completely or not at all, together with the tally that
@@ -61,7 +61,8 @@ pub struct Tally {
 }
 
 impl Tally {
-    fn drop(&mut self, reason: DropReason) {
+    /// Counts a dropped clip.
+    pub(super) fn drop(&mut self, reason: DropReason) {
         *self.dropped.entry(reason.text().to_owned()).or_default() += 1;
     }
 
@@ -94,7 +95,7 @@ pub struct Converted {
     pub interrupted: bool,
 }
 
-/// Converts all clips of `source`.
+/// Converts all clips of `source`. `watch` hears of every clip on the calling thread and may stop the work.
 ///
 /// # Errors
 /// The first one met; shards that are finished stay, and calling again goes on from there.
@@ -102,104 +103,112 @@ pub fn convert(
     source: &dyn Source,
     sink: &dyn ShardSink,
     settings: &ConvertSettings,
-    interrupt: &AtomicBool,
-    progress: &(dyn Fn(&Progress) + Sync),
+    watch: &mut dyn FnMut(&Progress) -> ControlFlow<()>,
 ) -> Result<Converted, SourceError> {
     if settings.clips_per_shard == 0 {
         return Err(SourceError::Settings("`clips_per_shard` is 0".to_owned()));
     }
     let total = source.len();
     let shards = total.div_ceil(settings.clips_per_shard);
-    let done = Mutex::new(0_usize);
-    let advance = |count: usize| {
-        let mut done = done
-            .lock()
-            .unwrap_or_else(std::sync::PoisonError::into_inner);
-        *done += count;
-        progress(&Progress { done: *done, total });
+    let range = |shard: usize| {
+        let first = shard * settings.clips_per_shard;
+        first..(first + settings.clips_per_shard).min(total)
     };
-    // `None` for shards that were not begun because of an interrupt.
-    let tallies: Vec<Option<(Tally, bool)>> = (0..shards)
-        .into_par_iter()
-        .map(|shard| {
-            let first = shard * settings.clips_per_shard;
-            let last = (first + settings.clips_per_shard).min(total);
-            if let Some(tally) = sink.finished(shard) {
-                advance(last - first);
-                return Ok(Some((tally, true)));
-            }
-            if interrupt.load(Ordering::Relaxed) {
-                return Ok(None);
-            }
-            let tally = Mutex::new(Tally::default());
-            let edit = |change: &dyn Fn(&mut Tally)| {
-                let mut tally = tally
-                    .lock()
-                    .unwrap_or_else(std::sync::PoisonError::into_inner);
-                change(&mut tally);
+    let finished: Vec<Option<Tally>> = (0..shards).map(|shard| sink.finished(shard)).collect();
+    let todo: Vec<usize> = (0..shards)
+        .filter(|shard| finished[*shard].is_none())
+        .flat_map(range)
+        .collect();
+    let threads = rayon::current_num_threads();
+    in_order(
+        todo.len(),
+        threads,
+        |position| source.clip(todo[position]),
+        |outcomes| {
+            let mut converted = Converted {
+                shards,
+                reused: 0,
+                tally: Tally::default(),
+                interrupted: false,
             };
-            let stopped = AtomicBool::new(false);
-            let mut clips = (first..last).filter_map(|index| {
-                if stopped.load(Ordering::Relaxed) {
-                    return None;
-                }
-                if interrupt.load(Ordering::Relaxed) {
-                    stopped.store(true, Ordering::Relaxed);
-                    return Some(Err(SourceError::Settings("interrupted".to_owned())));
-                }
-                let outcome = source.clip(index);
-                advance(1);
-                match outcome {
-                    Ok(Outcome::Clip(clip)) => {
-                        edit(&|tally| tally.clips += 1);
-                        Some(Ok(*clip))
+            let mut done = 0;
+            for (shard, finished) in finished.iter().enumerate() {
+                let count = range(shard).len();
+                if let Some(tally) = finished {
+                    done += count;
+                    converted.reused += 1;
+                    converted.tally.add(tally);
+                    converted.interrupted = watch(&Progress { done, total }).is_break();
+                } else {
+                    let mut clips = Shard {
+                        outcomes: &mut *outcomes,
+                        left: count,
+                        skip_damaged: settings.skip_damaged,
+                        tally: &RefCell::default(),
+                        interrupted: false,
+                        watch: &mut *watch,
+                        progress: Progress { done, total },
+                    };
+                    let tally = clips.tally;
+                    let written = sink.write(shard, &mut clips, &|| tally.borrow().clone());
+                    (done, converted.interrupted) = (clips.progress.done, clips.interrupted);
+                    // An interrupted shard is not there, whatever the sink says of it.
+                    if !converted.interrupted {
+                        written?;
+                        converted.tally.add(&tally.borrow());
                     }
-                    Ok(Outcome::Dropped { reason, .. }) => {
-                        edit(&|tally| tally.drop(reason));
-                        None
-                    }
-                    Err(error) if settings.skip_damaged => {
-                        edit(&|tally| tally.damaged.push(error.to_string()));
-                        None
-                    }
-                    Err(error) => Some(Err(error)),
                 }
-            });
-            let snapshot = || {
-                tally
-                    .lock()
-                    .unwrap_or_else(std::sync::PoisonError::into_inner)
-                    .clone()
-            };
-            let written = sink.write(shard, &mut clips, &snapshot);
-            if stopped.load(Ordering::Relaxed) {
-                return Ok(None);
+                if converted.interrupted {
+                    break;
+                }
             }
-            written?;
-            Ok(Some((snapshot(), false)))
-        })
-        .collect::<Result<_, SourceError>>()?;
-    let mut converted = Converted {
-        shards,
-        reused: 0,
-        tally: Tally::default(),
-        interrupted: false,
-    };
-    for entry in &tallies {
-        match entry {
-            Some((tally, reused)) => {
-                converted.tally.add(tally);
-                converted.reused += usize::from(*reused);
+            Ok(converted)
+        },
+    )
+}
+
+/// The clips of one shard as they come.
+struct Shard<'a, 'b, I: Iterator<Item = Result<Outcome, SourceError>>> {
+    outcomes: &'a mut I,
+    left: usize,
+    skip_damaged: bool,
+    tally: &'b RefCell<Tally>,
+    interrupted: bool,
+    watch: &'a mut dyn FnMut(&Progress) -> ControlFlow<()>,
+    progress: Progress,
+}
+
+impl<I: Iterator<Item = Result<Outcome, SourceError>>> Iterator for Shard<'_, '_, I> {
+    type Item = Result<Clip, SourceError>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        while self.left > 0 && !self.interrupted {
+            self.left -= 1;
+            let outcome = self.outcomes.next()?;
+            self.progress.done += 1;
+            if (self.watch)(&self.progress).is_break() && self.progress.done < self.progress.total {
+                self.interrupted = true;
+                return Some(Err(SourceError::Settings("interrupted".to_owned())));
             }
-            None => converted.interrupted = true,
+            let mut tally = self.tally.borrow_mut();
+            match outcome {
+                Ok(Outcome::Clip(clip)) => {
+                    tally.clips += 1;
+                    return Some(Ok(*clip));
+                }
+                Ok(Outcome::Dropped { reason, .. }) => tally.drop(reason),
+                Err(error) if self.skip_damaged => tally.damaged.push(error.to_string()),
+                Err(error) => return Some(Err(error)),
+            }
         }
+        None
     }
-    Ok(converted)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::sync::Mutex;
 
     struct Numbers;
 
@@ -270,13 +279,13 @@ mod tests {
             clips_per_shard: 10,
             skip_damaged: true,
         };
-        let go = AtomicBool::new(false);
-        let seen = Mutex::new(0);
-        let watch = |progress: &Progress| {
-            assert_eq!(progress.total, 25);
-            *seen.lock().unwrap() = progress.done;
-        };
-        let converted = convert(&Numbers, &sink, &settings, &go, &watch).unwrap();
+        let mut seen = 0;
+        let converted = convert(&Numbers, &sink, &settings, &mut |progress| {
+            assert_eq!((progress.total, progress.done), (25, seen + 1));
+            seen = progress.done;
+            ControlFlow::Continue(())
+        })
+        .unwrap();
         assert_eq!(
             (converted.shards, converted.reused, converted.interrupted),
             (3, 0, false)
@@ -287,11 +296,12 @@ mod tests {
             5
         );
         assert_eq!(converted.tally.damaged, ["clip 13 is damaged"]);
-        assert_eq!(*seen.lock().unwrap(), 25);
+        assert_eq!(seen, 25);
         assert_eq!(sink.0.lock().unwrap()[&2].0, ["20", "21", "22", "23"]);
         // Again: everything is there already, and the sums are the same.
         sink.0.lock().unwrap().remove(&1);
-        let again = convert(&Numbers, &sink, &settings, &go, &watch).unwrap();
+        let go = &mut |_: &Progress| ControlFlow::Continue(());
+        let again = convert(&Numbers, &sink, &settings, go).unwrap();
         assert_eq!((again.reused, &again.tally.clips), (2, &19));
         assert_eq!(again.tally.dropped, converted.tally.dropped);
     }
@@ -302,8 +312,7 @@ mod tests {
             &Numbers,
             &Memory::default(),
             &ConvertSettings::default(),
-            &AtomicBool::new(false),
-            &|_| {},
+            &mut |_| ControlFlow::Continue(()),
         );
         assert!(result.unwrap_err().to_string().contains("13"));
     }
@@ -311,24 +320,28 @@ mod tests {
     #[test]
     fn an_interrupt_leaves_only_whole_shards() {
         let sink = Memory::default();
-        let stop = AtomicBool::new(false);
         let settings = ConvertSettings {
             clips_per_shard: 5,
             skip_damaged: true,
         };
-        let converted = convert(&Numbers, &sink, &settings, &stop, &|progress| {
+        let mut stop = |progress: &Progress| {
             if progress.done >= 7 {
-                stop.store(true, Ordering::Relaxed);
+                return ControlFlow::Break(());
             }
-        })
-        .unwrap();
+            ControlFlow::Continue(())
+        };
+        let converted = convert(&Numbers, &sink, &settings, &mut stop).unwrap();
         assert!(converted.interrupted);
         for (ids, tally) in sink.0.lock().unwrap().values() {
             assert_eq!(ids.len(), tally.clips);
             assert!(ids.len() >= 3);
         }
-        stop.store(false, Ordering::Relaxed);
-        let rest = convert(&Numbers, &sink, &settings, &stop, &|_| {}).unwrap();
-        assert_eq!((rest.interrupted, rest.tally.clips), (false, 19));
+        assert_eq!(sink.0.lock().unwrap().len(), 1);
+        let go = &mut |_: &Progress| ControlFlow::Continue(());
+        let rest = convert(&Numbers, &sink, &settings, go).unwrap();
+        assert_eq!(
+            (rest.interrupted, rest.tally.clips, rest.reused),
+            (false, 19, 1)
+        );
     }
 }

@@ -1,15 +1,18 @@
 //! Many recordings as one [`Source`]: opened when needed, a few of them kept open.
 
+use super::declared::DeclaredTrack;
 use super::recording::{CutSettings, Recording};
 use super::{Outcome, Source, SourceError};
+use crate::modality::{ClipFormat, DeclaredSettings};
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, OnceLock};
 
 /// Opens one recording of a data set.
 pub type Open = fn(&Path, &CutSettings) -> Result<Recording, SourceError>;
 
-/// An open recording, or room for one.
-type Slot = Arc<OnceLock<Arc<Recording>>>;
+/// An open recording with its declared signals, or room for one.
+type Slot = Arc<OnceLock<Arc<(Recording, Vec<DeclaredTrack>)>>>;
 
 /// Recordings of one data set.
 pub struct Recordings {
@@ -19,7 +22,10 @@ pub struct Recordings {
     folders: Vec<PathBuf>,
     /// First clip of every recording, and the number of all clips at the end.
     starts: Vec<usize>,
+    names: Vec<String>,
     modalities: Vec<String>,
+    /// Modalities that a file of each folder brings.
+    declared: Vec<DeclaredSettings>,
     /// The recordings used last, the newest at the end.
     recent: Mutex<Vec<(usize, Slot)>>,
     keep: usize,
@@ -48,10 +54,11 @@ impl Recordings {
     ) -> Result<Self, SourceError> {
         settings.check()?;
         let mut starts = vec![0];
-        let mut modalities: Vec<String> = Vec::new();
+        let (mut modalities, mut names): (Vec<String>, Vec<String>) = Default::default();
         for folder in &folders {
             let recording = open(folder, &settings)?;
             starts.push(starts[starts.len() - 1] + recording.clips(&settings));
+            names.push(recording.id.clone());
             for modality in recording.modalities() {
                 if !modalities.contains(&modality) {
                     modalities.push(modality);
@@ -74,10 +81,19 @@ impl Recordings {
             open,
             folders,
             starts,
+            names,
             modalities,
+            declared: Vec::new(),
             recent: Mutex::new(Vec::new()),
             keep: rayon::current_num_threads() + 1,
         })
+    }
+
+    /// Gives the clips these modalities too, from the npz file of each recording that a declaration names.
+    #[must_use]
+    pub fn with_declared(mut self, declared: &[DeclaredSettings]) -> Self {
+        self.declared = declared.to_vec();
+        self
     }
 
     /// The folders, in the order of their clips.
@@ -86,7 +102,10 @@ impl Recordings {
         &self.folders
     }
 
-    fn recording(&self, number: usize) -> Result<Arc<Recording>, SourceError> {
+    fn recording(
+        &self,
+        number: usize,
+    ) -> Result<Arc<(Recording, Vec<DeclaredTrack>)>, SourceError> {
         let slot = {
             let mut recent = self
                 .recent
@@ -105,7 +124,13 @@ impl Recordings {
             return Ok(Arc::clone(recording));
         }
         // Two threads may open the same recording at the same time; one of the two results is kept.
-        let opened = Arc::new((self.open)(&self.folders[number], &self.settings)?);
+        let folder = &self.folders[number];
+        let tracks: Result<Vec<_>, _> = self
+            .declared
+            .iter()
+            .filter_map(|settings| DeclaredTrack::read(folder, settings).transpose())
+            .collect();
+        let opened = Arc::new(((self.open)(folder, &self.settings)?, tracks?));
         Ok(Arc::clone(slot.get_or_init(|| opened)))
     }
 }
@@ -123,6 +148,18 @@ impl Source for Recordings {
         self.modalities.clone()
     }
 
+    fn format(&self) -> Option<ClipFormat> {
+        Some(ClipFormat {
+            declared: self.declared.clone(),
+            ..self.settings.format()
+        })
+    }
+
+    fn recordings(&self) -> Vec<(String, Range<usize>)> {
+        let ranges = self.starts.windows(2).map(|pair| pair[0]..pair[1]);
+        self.names.iter().cloned().zip(ranges).collect()
+    }
+
     fn clip(&self, index: usize) -> Result<Outcome, SourceError> {
         if index >= self.len() {
             return Err(SourceError::OutOfRange {
@@ -132,8 +169,16 @@ impl Source for Recordings {
             });
         }
         let number = self.starts.partition_point(|start| *start <= index) - 1;
-        self.recording(number)?
-            .clip(index - self.starts[number], &self.settings)
+        let (recording, declared) = &*self.recording(number)?;
+        let inside = index - self.starts[number];
+        let mut outcome = recording.clip(inside, &self.settings)?;
+        if let Outcome::Clip(clip) = &mut outcome {
+            for track in declared {
+                let signal = track.clip(inside as f64 * self.settings.stride);
+                clip.declared.insert(track.name.clone(), signal);
+            }
+        }
+        Ok(outcome)
     }
 }
 

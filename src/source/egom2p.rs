@@ -15,9 +15,11 @@ use crate::clip::Depth;
 use crate::formats::npy::{self, NpyArray};
 use crate::formats::npz::Npz;
 use crate::geometry::camera::{Camera, KannalaBrandt, Lens};
+use crate::modality::ClipFormat;
 use nalgebra::{Isometry3, Matrix3, Point3, Rotation3, UnitQuaternion, Vector3};
 use ndarray::{Array3, Axis};
 use std::collections::{BTreeMap, BTreeSet};
+use std::ops::Range;
 use std::path::{Path, PathBuf};
 
 /// Folder names per modality, ours first; the numbers of the 512 pathway come last.
@@ -241,6 +243,16 @@ impl Source for Arrays {
             })
             .map(|(modality, _)| (*modality).to_owned())
             .collect()
+    }
+
+    fn format(&self) -> Option<ClipFormat> {
+        Some(self.settings.format())
+    }
+
+    /// Every file is a recording of its own.
+    fn recordings(&self) -> Vec<(String, Range<usize>)> {
+        let names = self.clips.iter().map(|(name, _)| name.clone());
+        names.zip((0..).map(|index| index..index + 1)).collect()
     }
 
     fn clip(&self, index: usize) -> Result<Outcome, SourceError> {

@@ -10,7 +10,8 @@
 //! * one file per data set: [`adt`], [`hot3d`], [`mps`], [`neutral`] (the folder format that any data set can be written
 //!   as), [`egom2p`] (the ancestors' layout)
 //! * [`world`]: the built-in synthetic world
-//! * [`dataset`] (many recordings), [`mixture`] (many sources), [`open`] (whatever a path holds), [`convert`] (into shards)
+//! * [`dataset`] (many recordings), [`mixture`] (many sources), [`open`] (whatever a path holds), [`split`] (for training, for the
+//!   test), [`convert`] into [`shards`], which are a source again, [`survey`] (a look at what is there)
 //!
 //! A further data set is one file that fills a [`recording::Recording`], and one line in [`open::Dataset`].
 
@@ -18,7 +19,9 @@ pub mod adt;
 pub mod aria;
 pub mod convert;
 pub mod csv;
+pub mod cut;
 pub mod dataset;
+mod declared;
 pub mod egom2p;
 pub mod error;
 pub mod hot3d;
@@ -27,8 +30,12 @@ pub mod mixture;
 pub mod mps;
 pub mod neutral;
 pub mod open;
+mod pipeline;
 pub mod recording;
 mod resize;
+pub mod shards;
+pub mod split;
+pub mod survey;
 pub mod track;
 pub mod umetrack;
 pub mod video;
@@ -37,6 +44,8 @@ pub mod world;
 pub use error::SourceError;
 
 use crate::clip::Clip;
+use crate::modality::ClipFormat;
+use std::ops::Range;
 
 /// A named list of clips, made on request.
 ///
@@ -56,6 +65,16 @@ pub trait Source: Send + Sync {
     /// The modalities a clip of this source can have, by registry name, in the order of
     /// `rgb depth camera gaze left_hand right_hand body`. A single clip may lack some of them.
     fn modalities(&self) -> Vec<String>;
+
+    /// The sizes of its clips, where they are known without looking at one.
+    fn format(&self) -> Option<ClipFormat> {
+        None
+    }
+
+    /// Stretches of time that belong together, by name, in the order of their clips: what is divided into splits.
+    fn recordings(&self) -> Vec<(String, Range<usize>)> {
+        vec![(self.name().to_owned(), 0..self.len())]
+    }
 
     /// Makes clip number `index`.
     ///

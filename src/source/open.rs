@@ -1,9 +1,11 @@
 //! A folder or file of any kind as a [`Source`]: what `reviv data` and the op `clips` call when they are given a path.
 
 use super::recording::{ColourFrames, CutSettings, Recording};
+use super::shards::ShardClips;
 use super::track::SECOND;
 use super::video::{Video, folder};
 use super::{Outcome, Source, SourceError, adt, egom2p, hot3d, image::Image, mps, neutral};
+use crate::modality::{ClipFormat, DeclaredSettings};
 use std::path::Path;
 use std::sync::Arc;
 
@@ -21,6 +23,8 @@ pub enum Dataset {
     Hot3dQuest,
     /// Aria recordings with the files of Machine Perception Services.
     Aria,
+    /// Clips in shards that were made before.
+    Shards,
     /// Folders with `recording.yaml`.
     Neutral,
     /// The ancestors' arrays, one folder per modality.
@@ -31,7 +35,8 @@ pub enum Dataset {
 
 impl Dataset {
     /// Every kind, in the order in which a path is tried.
-    pub const ALL: [Dataset; 7] = [
+    pub const ALL: [Dataset; 8] = [
+        Dataset::Shards,
         Dataset::Neutral,
         Dataset::Adt,
         Dataset::Hot3dAria,
@@ -49,6 +54,7 @@ impl Dataset {
             Dataset::Hot3dAria => "hot3d_aria",
             Dataset::Hot3dQuest => "hot3d_quest",
             Dataset::Aria => "aria",
+            Dataset::Shards => "shards",
             Dataset::Neutral => "neutral",
             Dataset::Egom2p => "egom2p",
             Dataset::Video => "video",
@@ -62,7 +68,8 @@ impl Dataset {
     }
 }
 
-/// Opens `path` as this kind of data set; without a kind, as the first kind that finds its recordings there.
+/// Opens `path` as this kind of data set; without a kind, as the first kind that finds its recordings there. Recordings that have
+/// folders of their own bring `declared` modalities with them.
 ///
 /// # Errors
 /// When nothing is found, or what is found cannot be opened.
@@ -70,10 +77,11 @@ pub fn open(
     path: &Path,
     kind: Option<Dataset>,
     settings: &CutSettings,
+    declared: &[DeclaredSettings],
 ) -> Result<Arc<dyn Source>, SourceError> {
     let Some(kind) = kind else {
         for kind in Dataset::ALL {
-            match open(path, Some(kind), settings) {
+            match open(path, Some(kind), settings, declared) {
                 // Nothing of this kind is there: try the next.
                 Err(SourceError::Missing { .. }) => {}
                 other => return other,
@@ -96,11 +104,12 @@ pub fn open(
         ));
     }
     Ok(match kind {
-        Dataset::Adt => Arc::new(adt::source(path, settings)?),
-        Dataset::Hot3dAria => Arc::new(hot3d::aria(path, settings)?),
-        Dataset::Hot3dQuest => Arc::new(hot3d::quest(path, settings)?),
-        Dataset::Aria => Arc::new(mps::source(path, settings)?),
-        Dataset::Neutral => Arc::new(neutral::source(path, settings)?),
+        Dataset::Adt => Arc::new(adt::source(path, settings)?.with_declared(declared)),
+        Dataset::Hot3dAria => Arc::new(hot3d::aria(path, settings)?.with_declared(declared)),
+        Dataset::Hot3dQuest => Arc::new(hot3d::quest(path, settings)?.with_declared(declared)),
+        Dataset::Aria => Arc::new(mps::source(path, settings)?.with_declared(declared)),
+        Dataset::Neutral => Arc::new(neutral::source(path, settings)?.with_declared(declared)),
+        Dataset::Shards => Arc::new(ShardClips::open(path)?),
         Dataset::Egom2p => Arc::new(egom2p::Arrays::open(path, None, None, settings)?),
         Dataset::Video => {
             if path.is_dir() {
@@ -151,6 +160,10 @@ impl Source for VideoClips {
 
     fn modalities(&self) -> Vec<String> {
         self.recording.modalities()
+    }
+
+    fn format(&self) -> Option<ClipFormat> {
+        Some(self.settings.format())
     }
 
     fn clip(&self, index: usize) -> Result<Outcome, SourceError> {

@@ -1,12 +1,16 @@
-//! The self-contained page that shows a reconstruction: one HTML file, no network, no server.
+//! What a person looks at: the self-contained page that shows a reconstruction (one HTML file, no network, no server), and
+//! pictures of what clips hold ([`contact`], [`paths`], both on a [`canvas`]).
 //!
 //! Read [`scene`] (what can be shown), then [`page`] (how it becomes one file). The page itself is `page/`: `page.html` with
 //! `page.css`, and a script in three parts, `data.js` (manifest and blobs), `draw.js` (WebGL2), `main.js` (layers, cameras,
 //! timeline, keyboard). `#t=1.5` in the address opens at a time, `#camera=first` with a camera, and `#selftest` makes the page
 //! examine itself and write what it saw into the document.
 
+pub mod canvas;
 pub mod cloud;
+pub mod contact;
 pub mod page;
+pub mod paths;
 pub mod scene;
 
 pub use page::write_page;

@@ -3,12 +3,14 @@
 
 mod bad_input;
 mod bad_input_binary;
+mod data;
 mod diagnostics;
 mod egom2p_examples;
 mod evaluation;
 mod full_disk;
 mod metrics;
 mod parity;
+mod readers_bad;
 mod reconstruction;
 mod recordings_bad;
 mod recordings_golden;

@@ -250,7 +250,7 @@ fn wrong_cells_are_named_by_line_and_nan_rows_are_gaps() {
 }
 
 /// A recording in the neutral format: three seconds of video, poses with a hole, gaze, hands, body and depth.
-fn neutral_folder(folder: &Path, depth_rate: f64, depth_start: f64) {
+pub fn neutral_folder(folder: &Path, depth_rate: f64, depth_start: f64) {
     let synthetic = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/synthetic_30fps.mp4");
     std::fs::copy(synthetic, folder.join("rgb.mp4")).unwrap();
     let poses = ndarray::Array3::from_shape_fn((75, 4, 4), |(t, r, c)| match (r, c) {

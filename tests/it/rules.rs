@@ -35,7 +35,7 @@ const LONGER: &[(&str, usize)] = &[
     ("src/reconstruction/predictions.rs", 530),
     ("src/source/aria/vrs/mod.rs", 686),
     ("src/source/neutral.rs", 753),
-    ("src/source/recording.rs", 736),
+    ("src/source/recording.rs", 671),
     ("src/source/video/mp4.rs", 704),
     ("src/source/world/furniture.rs", 627),
     ("src/source/world/script.rs", 686),

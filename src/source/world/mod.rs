@@ -9,9 +9,10 @@
 //!
 //! Read in this order: [`script`] (what happens), [`wearer`], [`hand`], [`steps`], [`motion`] (how it moves), [`room`],
 //! [`furniture`], [`object`], [`texture`] (what is there), [`primitive`], [`bins`], [`render`] (how it is seen), and
-//! [`episode`], which brings them together.
+//! [`episode`], which brings them together. [`clips`] is the world as a source like any other.
 
 mod bins;
+pub mod clips;
 pub mod episode;
 mod figure;
 mod furniture;
@@ -29,6 +30,7 @@ pub mod track;
 pub mod vector;
 pub mod wearer;
 
+pub use clips::WorldClips;
 pub use episode::Episode;
 
 use crate::clip::{Clip, Intrinsics, clock};

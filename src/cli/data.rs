@@ -1,0 +1,211 @@
+//! `reviv data`: recordings and the built-in world as clips: look at them, convert them, make them.
+
+mod convert;
+mod inspect;
+mod synthesize;
+
+use super::run::{interruptible, progress};
+use super::terminal::{Failure, Terminal};
+use crate::experiment::catalog::Catalog;
+use crate::experiment::diagnostic::Span;
+use crate::experiment::load::beside;
+use crate::experiment::registry::Registry;
+use crate::experiment::source::Sources;
+use crate::ops::clips::SourceSettings;
+use crate::source::convert::{ConvertSettings, Converted, convert};
+use crate::source::open::{Dataset, open};
+use crate::source::recording::CutSettings;
+use crate::source::shards::{Folder, Header};
+use crate::source::{Source, SourceError};
+use serde::Deserialize as _;
+use std::ops::ControlFlow;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+/// Look at recordings and clips, convert recordings, make clips of the built-in world
+#[derive(Debug, clap::Args)]
+pub struct Data {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, clap::Subcommand)]
+enum Command {
+    Inspect(inspect::Inspect),
+    Convert(convert::Convert),
+    Synthesize(synthesize::Synthesize),
+}
+
+impl super::Run for Data {
+    fn run(self, terminal: &Terminal) -> Result<(), Failure> {
+        match self.command {
+            Command::Inspect(command) => command.run(terminal),
+            Command::Convert(command) => command.run(terminal),
+            Command::Synthesize(command) => command.run(terminal),
+        }
+    }
+}
+
+/// How clips are cut from recordings.
+#[derive(Debug, Clone, clap::Args)]
+struct Cut {
+    /// What lies there: adt, hot3d_aria, hot3d_quest, aria, neutral, egom2p, video or shards; else what it looks like
+    #[arg(long, value_name = "KIND", value_parser = kind)]
+    kind: Option<Dataset>,
+    /// Frames per second of colour and depth
+    #[arg(long, default_value_t = 8.0, value_name = "HZ")]
+    fps: f64,
+    /// Side of the square frames
+    #[arg(long, default_value_t = 256, value_name = "PIXELS")]
+    side: u32,
+    /// Make pinhole pictures of this field of view of a fisheye recording
+    #[arg(long, value_name = "DEGREES")]
+    undistort: Option<f64>,
+    /// Seconds from the start of one clip to the start of the next
+    #[arg(long, default_value_t = 2.0, value_name = "SECONDS")]
+    stride: f64,
+    /// Take a recording shorter than a clip as one clip: the last frame is repeated, signals after the end are invalid
+    #[arg(long)]
+    pad_short: bool,
+}
+
+fn kind(text: &str) -> Result<Dataset, String> {
+    let names = Dataset::ALL.map(Dataset::name).join(", ");
+    Dataset::from_name(text).ok_or_else(|| format!("not one of {names}"))
+}
+
+impl Cut {
+    fn settings(&self) -> CutSettings {
+        CutSettings {
+            fps: self.fps,
+            side: self.side,
+            undistort: self.undistort,
+            pad_short: self.pad_short,
+            stride: self.stride,
+            ..CutSettings::default()
+        }
+    }
+
+    fn open(&self, path: &Path, settings: &CutSettings) -> Result<Arc<dyn Source>, Failure> {
+        settings.check().map_err(failure)?;
+        open(path, self.kind, settings, &[]).map_err(failure)
+    }
+}
+
+/// The settings of a registry entry of kind `source`.
+fn source_entry(name: &str) -> Result<SourceSettings, Failure> {
+    let catalog = Catalog::linked();
+    let mut registry = Registry::new(&catalog, beside(Path::new("./x"), "registry").as_deref());
+    let (mut sources, mut problems) = (Sources::default(), Vec::new());
+    if registry.text("source", name).is_none() {
+        let names = registry.names("source").join(", ");
+        return Err(Failure::input(
+            format!("there is no file, no folder and no registry source `{name}`"),
+            format!("registry sources: {names}"),
+        ));
+    }
+    let node = registry.settings(
+        "source",
+        name,
+        Span::point(0, 0),
+        &mut sources,
+        &mut problems,
+    );
+    let Some(node) = node else {
+        return Err(Failure::input(
+            format!("the registry source `{name}` cannot be read"),
+            format!("`reviv show source/{name}` shows it"),
+        ));
+    };
+    SourceSettings::deserialize(node.to_json()).map_err(|error| {
+        Failure::input(
+            format!("the registry source `{name}`: {error}"),
+            format!("`reviv show source/{name}` shows its settings"),
+        )
+    })
+}
+
+/// The user's files are for the user to mend, the disk is not.
+fn failure(error: SourceError) -> Failure {
+    match error {
+        SourceError::Io { .. } => Failure::machine(error),
+        error => Failure::input(error.to_string(), ""),
+    }
+}
+
+/// Converts into a folder with progress; says what became of it.
+fn write(
+    terminal: &Terminal,
+    source: &dyn Source,
+    request: serde_json::Value,
+    settings: &ConvertSettings,
+    output: &Path,
+    as_json: bool,
+) -> Result<(), Failure> {
+    let format = source.format().ok_or_else(|| {
+        Failure::input(
+            "the sizes of these clips are not known",
+            "convert the recordings again",
+        )
+    })?;
+    let header = Header {
+        source: source.name().to_owned(),
+        format,
+        request,
+        tally: None,
+    };
+    if source.is_empty() {
+        return Err(Failure::input(
+            format!("`{}` has no clip of two seconds", source.name()),
+            "`--pad-short` takes shorter recordings as one clip each",
+        ));
+    }
+    let folder = Folder::begin(output, header).map_err(failure)?;
+    let sink = folder.sink().map_err(failure)?;
+    let interrupt = interruptible(terminal)?;
+    let progress = progress(terminal);
+    let mut task = progress.task("clips");
+    let converted = convert(source, &sink, settings, &mut |now| {
+        task.update(now.done as u64, now.total as u64, "clips");
+        if interrupt.requested() {
+            return ControlFlow::Break(());
+        }
+        ControlFlow::Continue(())
+    });
+    drop(task);
+    let converted = converted.map_err(failure)?;
+    if converted.interrupted {
+        terminal.note("interrupted; give the same command again and it continues\n");
+        return Err(Failure::Ended(130));
+    }
+    folder.finish(converted.tally.clone()).map_err(failure)?;
+    say(terminal, &converted, output, as_json);
+    Ok(())
+}
+
+fn say(terminal: &Terminal, converted: &Converted, output: &Path, as_json: bool) {
+    let tally = &converted.tally;
+    if as_json {
+        terminal.json(&serde_json::json!({
+            "folder": output, "shards": converted.shards, "reused": converted.reused,
+            "clips": tally.clips, "dropped": tally.dropped, "damaged": tally.damaged,
+        }));
+        return;
+    }
+    terminal.note(format_args!(
+        "{} clips in {} shards ({} were there)\n",
+        tally.clips, converted.shards, converted.reused
+    ));
+    for (reason, count) in &tally.dropped {
+        terminal.note(format_args!("{count} dropped: {reason}\n"));
+    }
+    for error in &tally.damaged {
+        terminal.note(format_args!("left out: {error}\n"));
+    }
+    terminal.data(format_args!("{}\n", output.display()));
+}
+
+/// The path in words that every machine agrees on, so that a conversion can be recognised.
+fn absolute(path: &Path) -> PathBuf {
+    std::fs::canonicalize(path).unwrap_or_else(|_| path.to_owned())
+}

@@ -1,0 +1,236 @@
+//! A contact sheet: some frames of some clips with gaze and hands drawn in, their depth, and which samples of which signal are
+//! valid.
+
+use super::canvas::{Canvas, Colour, LETTER, LINE, viridis};
+use crate::clip::{Clip, Intrinsics, JointTrack};
+use crate::geometry::skeleton::HAND;
+use crate::source::image::Image;
+use ndarray::{Array1, Axis};
+
+/// Side of a frame, frames of a clip, and pixels between them.
+const TILE: usize = 176;
+const FRAMES: usize = 6;
+const GAP: usize = 4;
+const MARGIN: usize = 12;
+/// Height of a strip of validity.
+const STRIP: usize = 8;
+
+const PAPER: Colour = [24, 24, 28];
+const INK: Colour = [225, 225, 225];
+const FAINT: Colour = [130, 130, 135];
+const GAZE: Colour = [255, 230, 0];
+pub(super) const LEFT: Colour = [70, 170, 255];
+pub(super) const RIGHT: Colour = [255, 110, 70];
+const VALID: Colour = [70, 190, 110];
+const INVALID: Colour = [90, 40, 45];
+
+/// The sheet of these clips, one below the other.
+pub fn contact_sheet(clips: &[Clip]) -> Canvas {
+    let width = 2 * MARGIN + FRAMES * TILE + (FRAMES - 1) * GAP;
+    let heights: Vec<usize> = clips.iter().map(height).collect();
+    let mut canvas = Canvas::new(
+        width,
+        MARGIN + heights.iter().sum::<usize>().max(LINE),
+        PAPER,
+    );
+    let mut y = MARGIN;
+    for (clip, height) in clips.iter().zip(heights) {
+        draw(&mut canvas, clip, y);
+        y += height;
+    }
+    canvas
+}
+
+fn strips(clip: &Clip) -> Vec<(&'static str, Vec<f64>)> {
+    let share = |track: &JointTrack| {
+        let rows = track.valid.axis_iter(Axis(0));
+        rows.map(|row| row.iter().filter(|v| **v).count() as f64 / row.len().max(1) as f64)
+            .collect()
+    };
+    let one = |valid: &bool| f64::from(u8::from(*valid));
+    let mut strips = Vec::new();
+    if let Some(camera) = &clip.camera {
+        strips.push(("camera", camera.valid.iter().map(one).collect()));
+    }
+    if let Some(gaze) = &clip.gaze {
+        strips.push(("gaze", gaze.valid.iter().map(one).collect()));
+    }
+    for (name, track) in [
+        ("left hand", &clip.left_hand),
+        ("right hand", &clip.right_hand),
+        ("body", &clip.body),
+    ] {
+        strips.extend(track.as_ref().map(|track| (name, share(track))));
+    }
+    for signal in clip.declared.values() {
+        if let Some(valid) = &signal.valid {
+            strips.push(("declared", valid.iter().map(one).collect()));
+        }
+    }
+    strips
+}
+
+fn height(clip: &Clip) -> usize {
+    let rows = usize::from(clip.rgb.is_some()) + usize::from(clip.depth.is_some());
+    LINE + rows * (TILE + GAP) + strips(clip).len() * (STRIP + 4) + 2 * MARGIN
+}
+
+fn draw(canvas: &mut Canvas, clip: &Clip, mut y: usize) {
+    let mut title = clip.id.clone();
+    if clip.rgb.is_none() {
+        title += "   no colour";
+    }
+    if clip.gaze.is_some() {
+        title += "   gaze: ring";
+    }
+    let intrinsics = clip.camera.as_ref().and_then(|camera| camera.intrinsics);
+    let hands = clip.left_hand.is_some() || clip.right_hand.is_some();
+    title += match (hands, intrinsics) {
+        (true, Some(_)) => "   hands: left blue, right orange",
+        (true, None) => "   hands not drawn: fisheye, no pinhole intrinsics",
+        _ => "",
+    };
+    canvas.text(MARGIN, y, &title, INK);
+    y += LINE;
+    let column = |k: usize| MARGIN + k * (TILE + GAP);
+    if let Some(rgb) = &clip.rgb {
+        let (count, side) = (rgb.frames.shape()[0], rgb.frames.shape()[2]);
+        for (k, frame) in chosen(count).into_iter().enumerate() {
+            let picture = rgb.frames.index_axis(Axis(0), frame);
+            paste(
+                canvas,
+                column(k),
+                y,
+                side,
+                picture.iter().copied().collect(),
+            );
+            let seconds = frame as f64 / rgb.rate;
+            let place = |u: f64, v: f64| {
+                let inside = [u, v].iter().all(|x| (-0.01..1.01).contains(x));
+                let at = |origin: usize, x: f64| origin as f64 + x * TILE as f64;
+                inside.then(|| [at(column(k), u), at(y, v)])
+            };
+            if let Some(k) = &intrinsics {
+                for (track, colour) in [(&clip.left_hand, LEFT), (&clip.right_hand, RIGHT)] {
+                    if let Some(track) = track {
+                        hand(canvas, track, seconds, k, colour, &place);
+                    }
+                }
+            }
+            if let Some(gaze) = &clip.gaze {
+                let sample = (seconds * gaze.rate).round() as usize;
+                if gaze.valid.get(sample) == Some(&true)
+                    && let Some(at) = place(
+                        f64::from(gaze.points[(sample, 0)]),
+                        f64::from(gaze.points[(sample, 1)]),
+                    )
+                {
+                    canvas.ring(at, 6.0, 3.5, [0; 3]);
+                    canvas.ring(at, 6.0, 2.0, GAZE);
+                }
+            }
+            label(canvas, column(k), y, &format!("{seconds:.2} s"));
+        }
+        y += TILE + GAP;
+    }
+    if let Some(depth) = &clip.depth {
+        let side = depth.metres.shape()[2];
+        let mut values: Vec<f32> = depth
+            .metres
+            .iter()
+            .copied()
+            .filter(|v| v.is_finite())
+            .collect();
+        values.sort_by(f32::total_cmp);
+        let at = |share: f64| values.get((share * values.len() as f64) as usize).copied();
+        let (near, far) = (at(0.01).unwrap_or(0.0), at(0.99).unwrap_or(1.0));
+        for (k, frame) in chosen(depth.metres.shape()[0]).into_iter().enumerate() {
+            let map = depth.metres.index_axis(Axis(0), frame);
+            let colour = |z: &f32| {
+                if z.is_finite() {
+                    viridis(1.0 - f64::from((z - near) / (far - near).max(1e-3)))
+                } else {
+                    PAPER
+                }
+            };
+            paste(
+                canvas,
+                column(k),
+                y,
+                side,
+                map.iter().flat_map(colour).collect(),
+            );
+            if k == 0 {
+                label(canvas, column(k), y, &format!("{near:.2}-{far:.2} m"));
+            }
+        }
+        y += TILE + GAP;
+    }
+    let left = MARGIN + 12 * LETTER;
+    let width = FRAMES * TILE + (FRAMES - 1) * GAP - 12 * LETTER;
+    for (name, valid) in strips(clip) {
+        canvas.text(MARGIN, y, name, FAINT);
+        let all = Array1::from(valid);
+        for x in 0..width {
+            let share = all[x * all.len() / width];
+            let mixed = std::array::from_fn(|c| {
+                (f64::from(INVALID[c]) * (1.0 - share) + f64::from(VALID[c]) * share).round() as u8
+            });
+            canvas.fill(left + x, y, 1, STRIP, mixed);
+        }
+        y += STRIP + 4;
+    }
+}
+
+/// Frames spread over a clip.
+fn chosen(count: usize) -> Vec<usize> {
+    let shown = FRAMES.min(count);
+    (0..shown)
+        .map(|k| k * (count - 1) / (shown - 1).max(1))
+        .collect()
+}
+
+fn paste(canvas: &mut Canvas, x: usize, y: usize, side: usize, data: Vec<u8>) {
+    let picture = Image {
+        width: side as u32,
+        height: (data.len() / 3 / side.max(1)) as u32,
+        data,
+    };
+    let tile = picture.square(TILE as u32);
+    canvas.paste(x, y, TILE, &tile.data);
+}
+
+fn label(canvas: &mut Canvas, x: usize, y: usize, text: &str) {
+    canvas.fill(x, y, text.len() * LETTER + 4, LINE, [0; 3]);
+    canvas.text(x + 3, y + 2, text, INK);
+}
+
+fn hand(
+    canvas: &mut Canvas,
+    track: &JointTrack,
+    seconds: f64,
+    k: &Intrinsics,
+    colour: Colour,
+    place: &impl Fn(f64, f64) -> Option<[f64; 2]>,
+) {
+    let sample = (seconds * track.rate).round() as usize;
+    if sample >= track.joints.shape()[0] {
+        return;
+    }
+    let pixel = |joint: usize| {
+        let at = |c: usize| f64::from(track.joints[(sample, joint, c)]);
+        if !track.valid[(sample, joint)] || at(2) <= 0.02 {
+            return None;
+        }
+        let (u, v) = (k.fx * at(0) / at(2) + k.cx, k.fy * at(1) / at(2) + k.cy);
+        place(
+            (u + 0.5) / f64::from(k.width),
+            (v + 0.5) / f64::from(k.height),
+        )
+    };
+    for (a, b) in HAND.bones() {
+        if let (Some(a), Some(b)) = (pixel(a), pixel(b)) {
+            canvas.line(a, b, 1.6, colour);
+        }
+    }
+}
