@@ -1,12 +1,18 @@
 //! Speed of reading recordings: `cargo bench --bench recordings`.
 //!
 //! Uses `$REVIV_SHARED/data/video/ego_kitchen_1080p30_4s.mp4` and the ADT sample where they are, else only the small video of
-//! the tests. Aim: a 2 s clip of 1080p30 in at most 1.3 s with the embedded decoder, 0.8 s with `ffmpeg`.
+//! the tests. Aim: a 2 s clip of 1080p30 in at most 1.3 s with the embedded decoder, 0.8 s with `ffmpeg`; shards at
+//! 200 MB/s or more.
 
+use reviv::clip::store::ClipSet;
 use reviv::source::aria::vrs::Vrs;
+use reviv::source::convert::{ConvertSettings, convert};
 use reviv::source::recording::CutSettings;
+use reviv::source::shards::TarSink;
 use reviv::source::video::{DecoderChoice, Video, VideoSettings, ffmpeg};
+use reviv::source::world::{World, WorldClips, WorldSettings};
 use reviv::source::{Source, mps};
+use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
 fn main() {
@@ -64,4 +70,39 @@ fn mps_clip(bencher: divan::Bencher<'_, '_>) {
         let source = mps::source(&path, CutSettings::default()).expect("the recording opens");
         bencher.bench(|| source.clip(1).expect("the clip is made"));
     }
+}
+
+/// Shards of twelve world clips at the paper's size: bytes per second through the reader, clip by clip.
+#[divan::bench(sample_count = 10)]
+fn shards_stream(bencher: divan::Bencher<'_, '_>) {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let world = WorldClips::new(World::new(WorldSettings::default(), 0), 0..12);
+    let sink = TarSink::new(folder.path(), &folder.path().join(".finished")).expect("a sink");
+    let settings = ConvertSettings {
+        clips_per_shard: 4,
+        ..ConvertSettings::default()
+    };
+    convert(&world, &sink, &settings, &mut |_| ControlFlow::Continue(())).expect("clips are made");
+    let bytes: u64 = tars(folder.path()).iter().sum();
+    let set = ClipSet::open(folder.path()).expect("the shards open");
+    bencher
+        .counter(divan::counter::BytesCount::u64(bytes))
+        .bench(|| {
+            for index in 0..set.len() {
+                std::hint::black_box(set.clip(index).expect("the clip is read"));
+            }
+        });
+}
+
+fn tars(folder: &Path) -> Vec<u64> {
+    let mut sizes = Vec::new();
+    for entry in std::fs::read_dir(folder).expect("a folder") {
+        let entry = entry.expect("an entry");
+        if entry.path().is_dir() {
+            sizes.extend(tars(&entry.path()));
+        } else {
+            sizes.push(entry.metadata().expect("a size").len());
+        }
+    }
+    sizes
 }

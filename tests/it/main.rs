@@ -36,6 +36,7 @@ mod view;
 mod vq_structure;
 mod world;
 
+mod hot3d_recording;
 mod import;
 mod import_bad;
 mod import_models;

@@ -15,7 +15,7 @@ use std::path::Path;
 use std::sync::OnceLock;
 
 /// Two lines of a calibration over time.
-fn calibration_lines() -> String {
+pub fn calibration_lines() -> String {
     let line = |us: u64| {
         json!({"tracking_timestamp_us": us, "CameraCalibrations": [{
             "Label": "camera-rgb",
@@ -29,7 +29,7 @@ fn calibration_lines() -> String {
 }
 
 /// The shape of a hand, and two lines of its poses.
-fn hand() -> (String, String) {
+pub fn hand() -> (String, String) {
     let profile = json!({"hand_model": {
         "joint_rest_positions": (0..22).map(|k| [f64::from(k), 10.0, 0.0]).collect::<Vec<_>>(),
         "joint_rotation_axes": vec![[0.0, 0.0, 1.0]; 22],

@@ -15,9 +15,9 @@ use reviv::source::{Outcome, Source, SourceError, adt, egom2p, neutral};
 use std::path::Path;
 use std::sync::Arc;
 
-const LAYOUT: &str = r#"{"data_layout":[{"name":"frame_number","type":"DataPieceValue<uint64_t>","offset":0},
+pub const LAYOUT: &str = r#"{"data_layout":[{"name":"frame_number","type":"DataPieceValue<uint64_t>","offset":0},
     {"name":"capture_timestamp_ns","type":"DataPieceValue<int64_t>","offset":8}]}"#;
-const CONFIGURATION_LAYOUT: &str = r#"{"data_layout":[{"name":"image_width","type":"DataPieceValue<uint32_t>","offset":0},
+pub const CONFIGURATION_LAYOUT: &str = r#"{"data_layout":[{"name":"image_width","type":"DataPieceValue<uint32_t>","offset":0},
     {"name":"image_height","type":"DataPieceValue<uint32_t>","offset":4},{"name":"image_stride","type":"DataPieceValue<uint32_t>","offset":8},
     {"name":"image_pixel_format","type":"DataPieceValue<uint32_t>","offset":12},{"name":"description","type":"DataPieceString","index":0}]}"#;
 
