@@ -22,12 +22,20 @@ const TIMECODE_LAYOUT: &str = r#"{"data_layout":[{"name":"monotonic_timestamp_ns
 /// Stored pictures with a white left edge: turned clockwise, it is on top.
 fn jpeg() -> Vec<u8> {
     let pixels: Vec<u8> = (0..SIDE * SIDE)
-        .flat_map(|i| if i % SIDE < SIDE / 4 { [255; 3] } else { [40, 60, 80] })
+        .flat_map(|i| {
+            if i % SIDE < SIDE / 4 {
+                [255; 3]
+            } else {
+                [40, 60, 80]
+            }
+        })
         .collect();
     let mut bytes = Vec::new();
     let encoder = jpeg_encoder::Encoder::new(&mut bytes, 90);
     let side = u16::try_from(SIDE).unwrap();
-    encoder.encode(&pixels, side, side, jpeg_encoder::ColorType::Rgb).unwrap();
+    encoder
+        .encode(&pixels, side, side, jpeg_encoder::ColorType::Rgb)
+        .unwrap();
     bytes
 }
 
@@ -43,7 +51,13 @@ fn vrs() -> Vec<u8> {
             ("DL:Configuration:2:0", CONFIGURATION_LAYOUT),
         ],
     );
-    writer.stream(TIMECODE, &[("RF:Data:2", "data_layout"), ("DL:Data:2:0", TIMECODE_LAYOUT)]);
+    writer.stream(
+        TIMECODE,
+        &[
+            ("RF:Data:2", "data_layout"),
+            ("DL:Data:2:0", TIMECODE_LAYOUT),
+        ],
+    );
     let mut configuration = Vec::new();
     for value in [SIDE, SIDE, 3 * SIDE, 11, 0, 5] {
         configuration.extend(value.to_le_bytes());
@@ -76,7 +90,12 @@ fn recording(folder: &Path) {
     for k in 0..62_i64 {
         let time = START + APART + k * 33_333_333;
         writeln!(poses, "1,{time},{},0,0,1,0,0,0", k as f64 * 0.01).unwrap();
-        writeln!(hands, "{}", line.replace("\"timestamp_ns\":5", &format!("\"timestamp_ns\":{time}"))).unwrap();
+        writeln!(
+            hands,
+            "{}",
+            line.replace("\"timestamp_ns\":5", &format!("\"timestamp_ns\":{time}"))
+        )
+        .unwrap();
     }
     std::fs::write(folder.join("headset_trajectory.csv"), poses).unwrap();
     std::fs::write(folder.join("umetrack_hand_user_profile.json"), profile).unwrap();
@@ -90,25 +109,39 @@ fn recording(folder: &Path) {
 fn pictures_of_a_recording_vrs_meet_poses_and_hands_on_one_clock() {
     let folder = tempfile::tempdir().unwrap();
     recording(folder.path());
-    let settings = CutSettings { side: 32, ..CutSettings::default() };
+    let settings = CutSettings {
+        side: 32,
+        ..CutSettings::default()
+    };
     let source = hot3d::aria(folder.path(), settings).unwrap();
     assert_eq!(source.len(), 1);
     let clip = source.clip(0).unwrap().into_clip().unwrap();
     assert_eq!(clip.id, "hot3d_aria/own/000000");
     let rgb = clip.rgb.unwrap().frames;
     assert_eq!(rgb.dim(), (16, 32, 32, 3));
-    assert!(rgb[[5, 3, 16, 0]] > 240 && rgb[[5, 20, 16, 0]] < 60, "not turned upright");
+    assert!(
+        rgb[[5, 3, 16, 0]] > 240 && rgb[[5, 20, 16, 0]] < 60,
+        "not turned upright"
+    );
     let camera = clip.camera.unwrap();
     for k in [0, 15, 45] {
         assert!(camera.valid[k]);
         let position = camera.T_world_camera[k].translation.vector;
         let wanted = [k as f64 * 0.01, 0.01, -0.01];
-        assert!((position - nalgebra::Vector3::from(wanted)).norm() < 1e-4, "{k}: {position}");
+        assert!(
+            (position - nalgebra::Vector3::from(wanted)).norm() < 1e-4,
+            "{k}: {position}"
+        );
     }
     // The head goes by, so the hand goes the other way: 0.01 m per sample along stored x, which is upright -y.
     let hand = clip.left_hand.unwrap();
     assert!(hand.valid[[0, 0]] && hand.valid[[45, 0]]);
-    let moved: Vec<f32> = (0..3).map(|c| hand.joints[[45, 0, c]] - hand.joints[[0, 0, c]]).collect();
+    let moved: Vec<f32> = (0..3)
+        .map(|c| hand.joints[[45, 0, c]] - hand.joints[[0, 0, c]])
+        .collect();
     let length = moved.iter().map(|v| v * v).sum::<f32>().sqrt();
-    assert!((length - 0.45).abs() < 1e-3 && moved[1].abs() > 0.44, "{moved:?}");
+    assert!(
+        (length - 0.45).abs() < 1e-3 && moved[1].abs() > 0.44,
+        "{moved:?}"
+    );
 }
