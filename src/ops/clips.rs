@@ -346,12 +346,15 @@ impl Op for Clips {
     }
 }
 
+/// A split and its clips.
+type Part = (&'static str, Arc<dyn Source>);
+
 /// The clips of each split, in the order they are stored.
 fn parts(
     settings: &ClipsSettings,
     format: &ClipFormat,
     context: &dyn StageContext,
-) -> Result<Vec<(&'static str, Arc<dyn Source>)>, StageError> {
+) -> Result<Vec<Part>, StageError> {
     let from = &settings.source.settings;
     let Some(data) = &from.data else {
         let world = World::new(from.world.clone(), context.seed());
@@ -387,7 +390,7 @@ fn parts(
         .map(|(split, _, count)| (split, count))
         .collect();
     let divided = divide(source.as_ref(), &from.split, &asked).map_err(refused)?;
-    let mut parts: Vec<(&'static str, Arc<dyn Source>)> = Vec::new();
+    let mut parts: Vec<Part> = Vec::new();
     for (split, clips) in divided {
         if clips.is_empty() {
             return Err(StageError::Input {

@@ -46,8 +46,11 @@ pub fn paths(clips: &[Clip]) -> Canvas {
     canvas
 }
 
+/// Where the camera is, and where it looks.
+type Look = (Point3<f64>, Vector3<f64>);
+
 /// Camera positions and directions in the gravity frame of the first camera: x right, y forward, z up.
-fn camera_in_level_frame(camera: &CameraTrack) -> (Vec<Option<(Point3<f64>, Vector3<f64>)>>, bool) {
+fn camera_in_level_frame(camera: &CameraTrack) -> (Vec<Option<Look>>, bool) {
     let level = gravity_frame_of(camera).ok();
     let first = camera.valid.iter().position(|v| *v).unwrap_or(0);
     let T_level_world = level.unwrap_or_else(|| {
