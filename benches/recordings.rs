@@ -86,7 +86,7 @@ fn shards_stream(bencher: divan::Bencher<'_, '_>) {
     let bytes: u64 = tars(folder.path()).iter().sum();
     let set = ClipSet::open(folder.path()).expect("the shards open");
     bencher
-        .counter(divan::counter::BytesCount::u64(bytes))
+        .counter(divan::counter::BytesCount::new(bytes))
         .bench(|| {
             for index in 0..set.len() {
                 std::hint::black_box(set.clip(index).expect("the clip is read"));
