@@ -5,7 +5,7 @@ use super::run::{Place, interruptible, progress, tell};
 use super::terminal::{Failure, Terminal};
 use crate::experiment::catalog::Catalog;
 use crate::experiment::load::Request;
-use crate::reconstruction::folder::Manifest;
+use crate::reconstruction::folder::{FOLDER, Manifest, PAGE};
 use crate::run::execute::{Job, Outcome, cache_of, execute};
 use crate::run::schedule::Schedule;
 use crate::run::{Interrupt, RunDirectory, RunError, Shard, State, files, metrics};
@@ -98,7 +98,7 @@ impl Reconstruct {
             PathBuf::from(format!("{stem}_reconstruction"))
         });
         let taken = target.exists()
-            && !target.join("view.html").is_file()
+            && !target.join(PAGE).is_file()
             && std::fs::read_dir(&target).map_or(true, |mut entries| entries.next().is_some());
         if taken {
             return Err(Failure::input(
@@ -205,7 +205,7 @@ impl Reconstruct {
             }
         }
         terminal.note(text);
-        terminal.data(format_args!("{}\n", target.join("view.html").display()));
+        terminal.data(format_args!("{}\n", target.join(PAGE).display()));
         Ok(())
     }
 }
@@ -257,7 +257,7 @@ fn artifact(runs: &Path, outcome: &Outcome) -> Result<PathBuf, RunError> {
         message: format!("the experiment has no stage `{STAGE}`"),
         help: format!("`{FILE}` names it so"),
     })?;
-    Ok(cache_of(runs).path(&work.key))
+    Ok(cache_of(runs).path(&work.key).join(FOLDER))
 }
 
 /// Copies the result to where it was asked for; what an earlier result left there goes.

@@ -2,6 +2,7 @@
 
 use super::run::{Place, find, tell};
 use super::terminal::{Failure, Terminal};
+use crate::reconstruction::folder::{FOLDER, PAGE};
 use crate::run::execute::cache_of;
 use crate::run::files;
 use crate::run::schedule::Schedule;
@@ -44,7 +45,7 @@ impl super::Run for View {
 
 impl View {
     fn pages(&self, terminal: &Terminal) -> Result<Vec<PathBuf>, Failure> {
-        let own = self.run.join("view.html");
+        let own = self.run.join(PAGE);
         if own.is_file() {
             return Ok(vec![own]);
         }
@@ -55,7 +56,7 @@ impl View {
         let pages: Vec<PathBuf> = schedule
             .works
             .iter()
-            .map(|work| cache.path(&work.key).join("view.html"))
+            .map(|work| cache.path(&work.key).join(FOLDER).join(PAGE))
             .filter(|page| page.is_file())
             .collect();
         if pages.is_empty() {

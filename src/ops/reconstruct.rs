@@ -1,6 +1,7 @@
 //! `op: reconstruct`: one video of any length, or one stored clip, becomes a reconstruction folder (Sec. 4.1, Supp. C and D).
 //!
-//! The artifact is what [`crate::reconstruction::folder`] writes: arrays, exports, manifest and page.
+//! The artifact holds one folder, `reconstruction`, as [`crate::reconstruction::folder`] writes it: arrays, exports, manifest
+//! and page.
 
 mod recording;
 mod run;

@@ -51,6 +51,9 @@ pub struct TrainMgetSettings {
     pub positions: Positions,
     /// How often each data set is drawn, `tokens` first, then `more_tokens`; empty means in proportion to its clips.
     pub weights: Vec<f64>,
+    /// Share of the training clips of every data set that is used, the first ones.
+    #[schemars(range(min = 0.0, max = 1.0))]
+    pub train_share: f64,
     /// Where to train.
     pub device: DeviceChoice,
     /// Precision of matrix products; weights, norms and losses are always f32.
@@ -75,10 +78,18 @@ impl Default for TrainMgetSettings {
             tubelet: [4, 8, 8],
             positions: Positions::Released,
             weights: Vec::new(),
+            train_share: 1.0,
             device: DeviceChoice::Cpu,
             precision: Precision::F32,
             training: TrainingSettings::default(),
         }
+    }
+}
+
+impl TrainMgetSettings {
+    /// How many of `clips` training clips are used.
+    fn used(&self, clips: u64) -> u64 {
+        ((clips as f64 * self.train_share).round() as u64).clamp(1, clips.max(1))
     }
 }
 
@@ -189,7 +200,8 @@ impl Op for TrainMget {
         if let Err(error) = settings.masking.settings.check(&spec.slots()) {
             problems.push(masking_problem(&error));
         }
-        let measure = measure(settings, tokens.clips.get("train").copied().unwrap_or(1));
+        let clips = tokens.clips.get("train").copied().unwrap_or(1);
+        let measure = measure(settings, settings.used(clips));
         if let Err(error) = settings.training.learning_rates(measure) {
             problems.push(Problem::new(Code::E0206, "", error.to_string()));
         }
@@ -216,7 +228,7 @@ impl Op for TrainMget {
         };
         let spec = spec(settings, &tokens.tokens, pixel_shape(tokens));
         let clips = tokens.clips.get("train").copied().unwrap_or(1);
-        let measure = measure(settings, clips);
+        let measure = measure(settings, settings.used(clips));
         let training = &settings.training;
         let Ok(steps) = training.total_steps(measure) else {
             return StagePlan::default();

@@ -1,9 +1,8 @@
 //! The page of a run, `report/index.html`: state, stages, times, curves, what the ops have to show, settings, origin. One
 //! file, no network, no script.
 //!
-//! An op joins in by leaving `report/*.md`, `report/*.svg` or `report/*.png` in its artifact (or `view.html`, which is linked):
-//! pieces are shown in the order of
-//! their names under the stage's heading.
+//! An op joins in by leaving `report/*.md`, `report/*.svg` or `report/*.png` in its artifact (or
+//! `reconstruction/view.html`, which is linked): pieces are shown in the order of their names under the stage's heading.
 
 use super::cache::Cache;
 use super::curves::{self, Curve};
@@ -239,7 +238,7 @@ fn sections(
     Ok(())
 }
 
-/// A page of its own that an op left (`view.html`), copied beside this one and linked.
+/// The page of a reconstruction, copied beside this one and linked.
 fn linked(
     page: &mut String,
     work: &Work,
@@ -247,7 +246,7 @@ fn linked(
     directory: &RunDirectory,
     cache: &Cache,
 ) -> Result<(), RunError> {
-    let own = cache.path(&work.key).join("view.html");
+    let own = cache.path(&work.key).join("reconstruction/view.html");
     if !own.is_file() {
         return Ok(());
     }

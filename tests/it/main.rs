@@ -11,6 +11,7 @@ mod full_disk;
 mod metrics;
 mod parity;
 mod readers_bad;
+mod reconstruct_command;
 mod reconstruction;
 mod recordings_bad;
 mod recordings_golden;

@@ -8,7 +8,7 @@ use crate::engine::Compute;
 use crate::experiment::{StageContext, StageError};
 use crate::ops::predict::refused;
 use crate::reconstruction::anchor;
-use crate::reconstruction::folder::{Folder, Setting};
+use crate::reconstruction::folder::{FOLDER, Folder, Setting};
 use crate::reconstruction::windows::{samples_of, windows};
 use crate::run::environment::Stopwatch;
 use crate::view::Fact;
@@ -106,7 +106,8 @@ pub(super) fn run(
         badges: recording.badges.clone(),
         truth: recording.truth.clone(),
     };
-    let mut folder = Folder::new(context.output(), setting).map_err(StageError::other)?;
+    let mut folder =
+        Folder::new(&context.output().join(FOLDER), setting).map_err(StageError::other)?;
     let wish = Wish {
         given: &given,
         wanted: &wanted,

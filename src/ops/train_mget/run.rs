@@ -83,7 +83,10 @@ impl Run {
             sources.push(Arc::new(shards));
         }
         let names: Vec<&str> = sources.iter().map(|source| source.name()).collect();
-        let lengths: Vec<usize> = sources.iter().map(|source| source.len()).collect();
+        let lengths: Vec<usize> = sources
+            .iter()
+            .map(|source| settings.used(source.len() as u64) as usize)
+            .collect();
         let weights = (!settings.weights.is_empty()).then_some(settings.weights.as_slice());
         let order = Order::new(seed, &names, &lengths, weights).map_err(input_error)?;
         let training = &settings.training;
@@ -238,16 +241,9 @@ impl Run {
         let scores = self.validation.run(self.trainer.model());
         let step = self.trainer.progress().step;
         let mut scalars = Vec::new();
-        let mut text =
-            String::from("| modality | held-out loss | unigram | tokens |\n|---|---|---|---|\n");
         for (name, score) in &scores {
-            let unigram = self
-                .baseline
-                .get(name)
-                .map_or(f64::NAN, |baseline| baseline.loss);
             scalars.push((format!("validation/{name}"), score.loss));
-            scalars.push((format!("unigram/{name}"), unigram));
-            text.push_str(&row(name, score, unigram));
+            scalars.push((format!("unigram/{name}"), self.unigram(name)));
         }
         if !scores.is_empty() {
             let mean = scores.values().map(|score| score.loss).sum::<f64>() / scores.len() as f64;
@@ -257,9 +253,27 @@ impl Run {
                 .map(|(name, value)| (name.as_str(), *value))
                 .collect();
             context.record(step, &scalars)?;
-            context.record_text(step, "validation", &text)?;
+            context.record_text(step, "validation", &self.table(&scores))?;
         }
         Ok(scores)
+    }
+
+    /// The held-out loss that token frequencies alone give.
+    fn unigram(&self, modality: &str) -> f64 {
+        let baseline = self.baseline.get(modality);
+        baseline.map_or(f64::NAN, |score| score.loss)
+    }
+
+    /// Held-out losses beside the baseline, as Markdown.
+    fn table(&self, scores: &BTreeMap<String, Score>) -> String {
+        let mut text = String::from(
+            "| modality | held-out loss (nats) | token frequencies alone | tokens |\n|---|---:|---:|---:|\n",
+        );
+        for (name, Score { loss, tokens }) in scores {
+            let unigram = self.unigram(name);
+            text += &format!("| {name} | {loss:.4} | {unigram:.4} | {tokens} |\n");
+        }
+        text
     }
 
     fn publish(
@@ -275,6 +289,10 @@ impl Run {
         let validation = json!({"validation": scores, "unigram": self.baseline});
         let path = output.join(VALIDATION);
         std::fs::write(&path, format!("{validation:#}\n")).map_err(StageError::io(&path))?;
+        let report = output.join("report");
+        std::fs::create_dir_all(&report).map_err(StageError::io(&report))?;
+        let path = report.join("validation.md");
+        std::fs::write(&path, self.table(scores)).map_err(StageError::io(&path))?;
         if let Some(tokenizers) = &self.tokenizers {
             copy(tokenizers, &output.join(TOKENIZERS))?;
         }
@@ -316,9 +334,4 @@ fn copy(from: &Path, to: &Path) -> Result<(), StageError> {
         }
     }
     Ok(())
-}
-
-fn row(name: &str, score: &Score, unigram: f64) -> String {
-    let Score { loss, tokens } = score;
-    format!("| {name} | {loss:.4} | {unigram:.4} | {tokens} |\n")
 }

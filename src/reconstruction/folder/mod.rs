@@ -29,6 +29,11 @@ use std::collections::BTreeMap;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
+/// The name of the folder inside an artifact.
+pub const FOLDER: &str = "reconstruction";
+/// Its page.
+pub const PAGE: &str = "view.html";
+
 /// Side of the depth grid that the page and the fits use; the file keeps the full resolution.
 const GRID: usize = 64;
 /// Points of the whole recording in `points.ply`, at most.
@@ -215,7 +220,7 @@ impl Folder {
         self.write_points(&cloud, &mut manifest)?;
         let page = self.page(tracks, cloud, floor, &manifest);
         let path = self.path.clone();
-        write_file(&path, "view.html", &mut manifest.files, |out| {
+        write_file(&path, PAGE, &mut manifest.files, |out| {
             Ok(write_page(&page, out)?)
         })?;
         self.write_depth(&mut manifest)?;

@@ -1,0 +1,293 @@
+//! `reviv reconstruct` through the binary, with a model folder of untrained weights: what it takes, what it refuses, and that
+//! the same request gives the same bytes.
+
+use assert_cmd::Command;
+use reviv::decoding::reconstructor::{Binding, TOKENIZERS};
+use reviv::engine::{Compute, Initialise};
+use reviv::mget::{Mget, MgetSpec, ModalitySpec, Positions, Size};
+use reviv::modality::{self, ClipFormat, Shape};
+use reviv::tokenizer::Tokenizer;
+use reviv::tokenizer::normaliser::Normaliser;
+use reviv::tokenizer::trained::VqTokenizer;
+use reviv::tokenizer::video::{Network, VideoSettings, VideoTokenizer};
+use reviv::tokenizer::vq::{VqSettings, VqVae};
+use std::collections::BTreeMap;
+use std::path::Path;
+
+const SIDE: usize = 32;
+
+/// A whole model folder for 16 frames of 32 x 32 pixels. Nothing in it has been trained.
+fn model_folder(folder: &Path, seed: u64) {
+    let compute = Compute::cpu();
+    let format = ClipFormat {
+        size: SIDE,
+        ..ClipFormat::default()
+    };
+    let mut modalities = Vec::new();
+    for name in [
+        "body",
+        "camera",
+        "depth",
+        "gaze",
+        "left_hand",
+        "rgb",
+        "right_hand",
+    ] {
+        let modality = modality::built_in(name, &format).unwrap();
+        let path = folder.join(TOKENIZERS).join(name);
+        std::fs::create_dir_all(&path).unwrap();
+        let place = Initialise::new(&compute, seed);
+        let (grid, vocabulary) = match modality.shape() {
+            Shape::Video {
+                frames,
+                height,
+                width,
+            } => {
+                let settings = VideoSettings {
+                    channels: 8,
+                    multipliers: vec![1, 1],
+                    blocks: 1,
+                    patch: 4,
+                    latent_channels: 4,
+                    levels: vec![4, 4],
+                    spatial: 8,
+                    temporal: 4,
+                };
+                let network = Network::new(&place, &settings).unwrap();
+                let tokenizer =
+                    VideoTokenizer::new(name, [frames, height, width], network, &compute).unwrap();
+                tokenizer.write(&path).unwrap();
+                (tokenizer.grid().to_vec(), tokenizer.vocabulary())
+            }
+            shape => {
+                let compression = match shape {
+                    Shape::Temporal { .. } => vec![2],
+                    _ => vec![2, 3],
+                };
+                let settings = VqSettings {
+                    codebook: 16,
+                    code_width: 4,
+                    compression,
+                    width: 24,
+                    depth: 1,
+                    heads: 2,
+                    mlp_ratio: 2,
+                    ..VqSettings::default()
+                };
+                let model = VqVae::new(&place, &settings, &shape).unwrap();
+                let values = model.patches().values_per_sample();
+                let statistics = Normaliser::constant(values, 0.0, 1.0).unwrap();
+                let tokenizer = VqTokenizer::new(name, shape, statistics, &model).unwrap();
+                tokenizer.write(&path).unwrap();
+                (tokenizer.grid().to_vec(), tokenizer.vocabulary())
+            }
+        };
+        modalities.push(ModalitySpec::tokens(name, &grid, vocabulary));
+    }
+    let spec = MgetSpec {
+        size: Size {
+            width: 24,
+            heads: 2,
+            encoder_depth: 1,
+            decoder_depth: 1,
+            hidden: 0,
+        },
+        positions: Positions::Aligned,
+        modalities,
+    };
+    let model = Mget::new(&spec, &Initialise::new(&compute, seed)).unwrap();
+    model.save(folder).unwrap();
+    Binding::of(folder, format).unwrap().write(folder).unwrap();
+}
+
+/// A folder of pictures: `frames` of `width` x `height`, in which something moves unless `still`.
+fn pictures(folder: &Path, frames: usize, [width, height]: [u32; 2], black: bool) {
+    std::fs::create_dir_all(folder).unwrap();
+    for frame in 0..frames {
+        let file = std::fs::File::create(folder.join(format!("{frame:05}.png"))).unwrap();
+        let mut encoder = png::Encoder::new(file, width, height);
+        encoder.set_color(png::ColorType::Rgb);
+        let mut writer = encoder.write_header().unwrap();
+        let value = |x: u32, y: u32, c: u32| {
+            if black {
+                0
+            } else {
+                ((x * 3 + y * 5 + c * 40 + frame as u32 * 7) % 256) as u8
+            }
+        };
+        let data: Vec<u8> = (0..height)
+            .flat_map(|y| (0..width).flat_map(move |x| (0..3).map(move |c| (x, y, c))))
+            .map(|(x, y, c)| value(x, y, c))
+            .collect();
+        writer.write_image_data(&data).unwrap();
+    }
+}
+
+struct Place {
+    root: tempfile::TempDir,
+}
+
+impl Place {
+    fn new() -> Self {
+        let place = Self {
+            root: tempfile::tempdir().unwrap(),
+        };
+        model_folder(&place.path("model"), 1);
+        place
+    }
+
+    fn path(&self, name: &str) -> std::path::PathBuf {
+        self.root.path().join(name)
+    }
+
+    fn command(&self, video: &str, output: &str) -> Command {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_reviv"));
+        command.current_dir(self.root.path()).args([
+            "reconstruct",
+            video,
+            "--model",
+            "model",
+            "-o",
+            output,
+        ]);
+        command
+    }
+
+    /// Runs it and gives what it said, which must hold `words`.
+    fn refuses(&self, video: &str, words: &str) {
+        let output = self.command(video, "refused").assert().code(1);
+        let said = String::from_utf8_lossy(&output.get_output().stderr).into_owned();
+        assert!(said.contains(words), "{words:?} is not in:\n{said}");
+        assert!(!said.contains("panicked"), "{said}");
+    }
+}
+
+fn files(folder: &Path) -> BTreeMap<String, Vec<u8>> {
+    std::fs::read_dir(folder)
+        .unwrap()
+        .map(|entry| entry.unwrap().path())
+        .filter(|path| path.is_file())
+        .map(|path| {
+            let name = path.file_name().unwrap().to_string_lossy().into_owned();
+            (name, std::fs::read(path).unwrap())
+        })
+        .collect()
+}
+
+#[test]
+fn a_video_becomes_a_complete_folder_and_the_same_bytes_again() {
+    let place = Place::new();
+    pictures(&place.path("walk"), 100, [48, 40], false);
+    let said = place.command("walk", "one").assert().success();
+    let said = String::from_utf8_lossy(&said.get_output().stderr).into_owned();
+    for words in [
+        "ASSUMED: 90 degrees",
+        "first camera is level",
+        "Frame rate",
+        "the centre 40 x 40",
+    ] {
+        assert!(said.contains(words), "{words:?} is not in:\n{said}");
+    }
+    let one = files(&place.path("one"));
+    for name in [
+        "camera.tum",
+        "camera.npz",
+        "gaze.csv",
+        "body.npz",
+        "body.bvh",
+        "hands.npz",
+        "depth.npz",
+        "points.ply",
+        "view.html",
+        "manifest.json",
+    ] {
+        assert!(
+            one.contains_key(name),
+            "{name} is missing: {:?}",
+            one.keys()
+        );
+    }
+    // Another place for runs: nothing is found in a cache, everything is made again, on one thread.
+    place
+        .command("walk", "two")
+        .args(["--runs", "elsewhere"])
+        .env("RAYON_NUM_THREADS", "1")
+        .assert()
+        .success();
+    assert!(one == files(&place.path("two")), "two runs differ");
+}
+
+#[test]
+fn short_still_black_and_portrait_videos_are_reconstructed() {
+    let place = Place::new();
+    pictures(&place.path("one_frame"), 1, [40, 40], false);
+    pictures(&place.path("black"), 30, [40, 40], true);
+    pictures(&place.path("portrait"), 30, [36, 64], false);
+    for video in ["one_frame", "black", "portrait"] {
+        place
+            .command(video, &format!("{video}_out"))
+            .assert()
+            .success();
+        assert!(place.path(&format!("{video}_out/view.html")).is_file());
+    }
+}
+
+#[test]
+fn what_is_no_video_is_refused_with_a_reason() {
+    let place = Place::new();
+    place.refuses("nowhere.mp4", "no file `nowhere.mp4`");
+    std::fs::create_dir(place.path("empty")).unwrap();
+    place.refuses("empty", "empty");
+    std::fs::write(
+        place.path("cut.mp4"),
+        b"\0\0\0\x18ftypisom\0\0\x02\0isomiso2avc1mp41\0\0",
+    )
+    .unwrap();
+    place.refuses("cut.mp4", "cut.mp4");
+    std::fs::write(
+        place.path("text.mp4"),
+        b"this is a text, and no video at all",
+    )
+    .unwrap();
+    place.refuses("text.mp4", "text.mp4");
+}
+
+#[test]
+fn a_model_that_is_none_or_not_whole_is_refused() {
+    let place = Place::new();
+    pictures(&place.path("walk"), 4, [40, 40], false);
+    // Weights and tokenizers of two models.
+    let other = tempfile::tempdir().unwrap();
+    model_folder(other.path(), 2);
+    let file = "tokenizers/camera/tokenizer.safetensors";
+    let own = std::fs::read(place.path("model").join(file)).unwrap();
+    std::fs::copy(other.path().join(file), place.path("model").join(file)).unwrap();
+    place.refuses("walk", "not the one the model was trained on");
+    std::fs::write(place.path("model").join(file), own).unwrap();
+    std::fs::write(place.path("model/weights.safetensors"), b"damaged").unwrap();
+    place.refuses("walk", "no model folder");
+    std::fs::remove_file(place.path("model/model.json")).unwrap();
+    place.refuses("walk", "no model folder");
+    std::fs::remove_dir_all(place.path("model")).unwrap();
+    place.refuses("walk", "no run `model`");
+    let none = Command::new(env!("CARGO_BIN_EXE_reviv"))
+        .current_dir(place.root.path())
+        .args(["reconstruct", "walk", "-o", "out"])
+        .assert()
+        .code(1);
+    let said = String::from_utf8_lossy(&none.get_output().stderr).into_owned();
+    assert!(
+        said.contains("reviv run experiments/quickstart.yaml"),
+        "{said}"
+    );
+}
+
+#[test]
+fn a_folder_that_holds_something_else_is_left_alone() {
+    let place = Place::new();
+    pictures(&place.path("walk"), 4, [40, 40], false);
+    std::fs::create_dir(place.path("precious")).unwrap();
+    std::fs::write(place.path("precious/letter.txt"), b"dear").unwrap();
+    place.command("walk", "precious").assert().code(1);
+    assert!(place.path("precious/letter.txt").is_file());
+}
