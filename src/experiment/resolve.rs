@@ -725,7 +725,13 @@ impl Resolver<'_> {
         if let Some(name) = &compare.baseline {
             unknown("baseline", "arm", name, &arms);
         }
-        let columns: Vec<&str> = columns.iter().map(String::as_str).collect();
+        // `depth.abs_rel` stands for `depth.abs_rel@depth` and every other space of it.
+        let stems = columns.iter().filter_map(|name| name.split_once('@'));
+        let columns: Vec<&str> = columns
+            .iter()
+            .map(String::as_str)
+            .chain(stems.map(|(stem, _)| stem))
+            .collect();
         if !columns.is_empty() {
             for (index, name) in compare.columns.iter().enumerate() {
                 unknown(&format!("columns.{index}"), "column", name, &columns);
