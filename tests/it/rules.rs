@@ -292,3 +292,89 @@ fn every_shipped_experiment_checks_and_plans() {
         }
     }
 }
+
+/// Files and folders of the package that a page names between backticks; `file::name` names a test in it.
+fn named(page: &str) -> impl Iterator<Item = (&str, Option<&str>)> {
+    const FOLDERS: [&str; 7] = [
+        "src/",
+        "registry/",
+        "experiments/",
+        "tests/",
+        "examples/",
+        "benches/",
+        "docs/",
+    ];
+    page.split('`')
+        .skip(1)
+        .step_by(2)
+        .filter(|code| FOLDERS.iter().any(|folder| code.starts_with(folder)))
+        .map(|code| match code.split_once("::") {
+            Some((path, test)) => (path, Some(test)),
+            None => (code, None),
+        })
+}
+
+/// `Sec. 4.2`, `Supp. A`, `Alg. 1`, `Eq. 3`, `Table 1`: the parts of the paper that a text quotes.
+fn quoted(text: &str) -> Vec<String> {
+    let mut found = Vec::new();
+    for mark in ["Sec. ", "Supp. ", "Alg. ", "Eq. ", "Table "] {
+        for rest in text.split(mark).skip(1) {
+            let number = |c: char| c.is_ascii_alphanumeric() || c == '.';
+            let part = rest.split(|c| !number(c)).next().unwrap_or_default();
+            let part = part.trim_end_matches('.');
+            let whole = part.starts_with(|c: char| c.is_ascii_digit()) || part.len() == 1;
+            if whole && !part.is_empty() {
+                found.push(format!("{mark}{part}"));
+            }
+        }
+    }
+    found
+}
+
+#[test]
+fn pages_name_files_and_tests_that_exist() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let mut missing = Vec::new();
+    for name in [
+        "docs/paper.md",
+        "docs/compare.md",
+        "README.md",
+        "ARCHITECTURE.md",
+        "DESIGN.md",
+    ] {
+        let page = std::fs::read_to_string(root.join(name)).unwrap();
+        for (path, test) in named(&page) {
+            let there = match test {
+                None => root.join(path).exists(),
+                Some(test) => std::fs::read_to_string(root.join(path))
+                    .is_ok_and(|text| text.contains(&format!("fn {test}("))),
+            };
+            if !there {
+                missing.push(format!("{name}: {path} {}", test.unwrap_or_default()));
+            }
+        }
+    }
+    assert!(missing.is_empty(), "{}", missing.join("\n"));
+}
+
+#[test]
+fn the_map_of_the_paper_has_every_room_of_science_and_every_quoted_section() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let page = std::fs::read_to_string(root.join("docs/paper.md")).unwrap();
+    let mut missing: Vec<String> = Vec::new();
+    for room in FLOORS[3..].iter().copied().flatten() {
+        let inside = format!("src/{room}/");
+        let alone = format!("src/{room}.rs");
+        if !named(&page).any(|(path, _)| path.starts_with(&inside) || path == alone) {
+            missing.push(format!("the room `{room}`"));
+        }
+    }
+    for file in files("src") {
+        for part in quoted(&file.text) {
+            if !page.contains(&part) {
+                missing.push(format!("{part}, quoted in {}", file.name));
+            }
+        }
+    }
+    assert!(missing.is_empty(), "{}", missing.join("\n"));
+}
