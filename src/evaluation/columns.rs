@@ -148,6 +148,12 @@ pub const PER_CLIP: &[Entry] = &[
         "mean position error without any alignment, first poses laid on each other",
     ),
     (
+        "camera.rotation",
+        "deg",
+        Lower,
+        "mean rotation error without any alignment, first poses laid on each other",
+    ),
+    (
         "gaze.mse",
         "",
         Lower,
