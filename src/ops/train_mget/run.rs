@@ -15,6 +15,7 @@ use crate::training::{
 };
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
+use std::fmt::Write as _;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -271,7 +272,7 @@ impl Run {
         );
         for (name, Score { loss, tokens }) in scores {
             let unigram = self.unigram(name);
-            text += &format!("| {name} | {loss:.4} | {unigram:.4} | {tokens} |\n");
+            let _ = writeln!(text, "| {name} | {loss:.4} | {unigram:.4} | {tokens} |");
         }
         text
     }
