@@ -32,7 +32,6 @@ const LONGER: &[(&str, usize)] = &[
     ("src/experiment/resolve.rs", 845),
     ("src/experiment/typed.rs", 823),
     ("src/experiment/yaml.rs", 586),
-    ("src/reconstruction/predictions.rs", 530),
     ("src/source/aria/vrs/mod.rs", 686),
     ("src/source/neutral.rs", 753),
     ("src/source/recording.rs", 671),
