@@ -55,7 +55,12 @@ impl Terminal {
 
     /// Writes data to stdout. A reader that has seen enough ends the process quietly.
     pub fn data(&self, text: impl Display) {
-        write_to(&mut std::io::stdout().lock(), &text);
+        let written = write_to(&mut std::io::stdout().lock(), &text);
+        if let Err(error) = written
+            && error.kind() == std::io::ErrorKind::BrokenPipe
+        {
+            std::process::exit(0);
+        }
     }
 
     /// Writes JSON to stdout.
@@ -68,7 +73,8 @@ impl Terminal {
 
     /// Writes anything else to stderr.
     pub fn note(&self, text: impl Display) {
-        write_to(&mut std::io::stderr().lock(), &text);
+        // Where nobody listens, there is nobody to tell; the exit code still says it.
+        let _ = write_to(&mut std::io::stderr().lock(), &text);
     }
 
     /// Says why the command failed; gives the exit code.
@@ -97,11 +103,6 @@ impl Default for Terminal {
     }
 }
 
-fn write_to(stream: &mut impl std::io::Write, text: &impl Display) {
-    let written = write!(stream, "{text}").and_then(|()| stream.flush());
-    if let Err(error) = written
-        && error.kind() == std::io::ErrorKind::BrokenPipe
-    {
-        std::process::exit(0);
-    }
+fn write_to(stream: &mut impl std::io::Write, text: &impl Display) -> std::io::Result<()> {
+    write!(stream, "{text}").and_then(|()| stream.flush())
 }

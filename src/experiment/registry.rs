@@ -48,8 +48,11 @@ impl Registry {
             registry.insert(entry.clone());
         }
         if let Some(folder) = folder {
-            for entry in project(folder) {
-                registry.insert(entry);
+            for (entry, unread) in project(folder) {
+                match unread {
+                    None => registry.insert(entry),
+                    Some(reason) => registry.problems.push((entry, reason)),
+                }
             }
         }
         registry
@@ -299,7 +302,7 @@ pub fn head(text: &str) -> Option<(&str, &str)> {
 }
 
 /// The entries of a project folder, sorted by path. Unreadable files are skipped: they are no entries.
-fn project(folder: &Path) -> Vec<EntryText> {
+fn project(folder: &Path) -> Vec<(EntryText, Option<String>)> {
     let mut entries = Vec::new();
     let mut folders = vec![folder.to_owned()];
     let mut seen = 0;
@@ -319,15 +322,19 @@ fn project(folder: &Path) -> Vec<EntryText> {
             } else if path
                 .extension()
                 .is_some_and(|extension| extension == "yaml" || extension == "yml")
-                && let Ok(text) = super::load::read(&path)
             {
-                entries.push(EntryText {
+                let (text, unread) = match super::load::read(&path) {
+                    Ok(text) => (text, None),
+                    Err(reason) => (String::new(), Some(format!("cannot be read: {reason}"))),
+                };
+                let entry = EntryText {
                     place: path.display().to_string(),
                     text: text.into(),
-                });
+                };
+                entries.push((entry, unread));
             }
         }
     }
-    entries.sort_by(|a, b| a.place.cmp(&b.place));
+    entries.sort_by(|(a, _), (b, _)| a.place.cmp(&b.place));
     entries
 }

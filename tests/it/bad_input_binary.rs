@@ -103,7 +103,7 @@ fn files_that_are_no_experiments_are_refused_at_the_door() {
         (
             "base",
             b"sweep: a\nbase: base.yaml\narms: {a: {}}\n".to_vec(),
-            "E0104",
+            "E0206",
         ),
         (
             "set",
