@@ -163,7 +163,7 @@ fn numbers(errors: &TrajectoryErrors) -> serde_json::Value {
 }
 
 /// The rows that `name` stands for: a scores file, a folder with one, or a run.
-fn entrants_of(name: &str, runs: &Path) -> Result<Vec<Entrant>, Failure> {
+pub fn entrants_of(name: &str, runs: &Path) -> Result<Vec<Entrant>, Failure> {
     let path = Path::new(name);
     let read = |path: &Path| {
         Scores::read(path)

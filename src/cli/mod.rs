@@ -16,6 +16,7 @@ mod request;
 mod run;
 mod schema;
 mod show;
+mod sweep_table;
 mod terminal;
 mod verify;
 mod view;
@@ -74,6 +75,9 @@ commands! {
 /// Reconstruct the viewer and the view in 4D from one head-mounted video.
 #[derive(clap::Parser)]
 #[command(name = "reviv", version, about, max_term_width = 100)]
+#[command(
+    after_help = "Exit codes: 0 done, 1 the input is at fault, 2 the machine or a bug, 130 stopped by Ctrl-C"
+)]
 struct Arguments {
     #[command(subcommand)]
     command: Command,
@@ -86,7 +90,7 @@ fn grammar() -> clap::Command {
 
 /// Runs the `reviv` command line on the process arguments. Plug-in binaries call this from their own `main`.
 ///
-/// Exit codes: 0 done, 1 the user's input, 2 the machine or a bug.
+/// Exit codes: 0 done, 1 the user's input, 2 the machine or a bug, 130 stopped by Ctrl-C (the run continues when asked again).
 pub fn main() -> ExitCode {
     let arguments = match Arguments::try_parse() {
         Ok(arguments) => arguments,

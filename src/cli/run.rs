@@ -1,6 +1,7 @@
 //! `reviv run`: an experiment or a sweep, from where it stands to its end.
 
 use super::request::{Changes, open};
+use super::sweep_table;
 use super::terminal::{Failure, Terminal};
 use crate::experiment::catalog::Catalog;
 use crate::run::execute::{Job, Outcome, execute};
@@ -48,6 +49,10 @@ impl super::Run for Run {
             interrupt: &interrupt,
         };
         let outcome = execute(&job).map_err(|error| tell(terminal, &error))?;
+        if let (State::Done, Some(compare)) = (outcome.state, &experiment.compare) {
+            let table = sweep_table::write(&catalog, &experiment, compare, &outcome.run)?;
+            terminal.note(format_args!("\n{table}\n"));
+        }
         finish(terminal, &outcome, &interrupt)
     }
 }

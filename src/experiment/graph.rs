@@ -55,6 +55,16 @@ impl Cell {
 #[derive(Clone, Default)]
 pub struct Graph {
     pub stages: Vec<Stage>,
+    /// The keys beside the stages, for `reviv why`: `experiment`, `about`, `seed`, `params.x`.
+    pub head: Vec<Head>,
+}
+
+/// A value of the experiment itself.
+#[derive(Debug, Clone)]
+pub struct Head {
+    pub key: String,
+    pub value: String,
+    pub trace: Trace,
 }
 
 /// A stage: an op with complete settings and resolved edges.

@@ -118,6 +118,38 @@ pub fn check(catalog: &Catalog, request: &Request) -> (Option<Experiment>, Repor
     (None, report)
 }
 
+/// The settings of a registry entry, complete, as an experiment in `path` sees it; `None` where it has mistakes.
+pub fn entry(catalog: &Catalog, path: &Path, kind: &str, name: &str) -> Option<serde_json::Value> {
+    let facts = catalog.kind(kind)?;
+    let mut report = Report::default();
+    let mut registry = Registry::new(catalog, beside(path, "registry").as_deref());
+    let layer = report.sources.add(Source {
+        name: path.display().to_string(),
+        path: None,
+        text: String::new(),
+        origin: Origin::File,
+    });
+    let asked = Span::point(layer, 0);
+    let node = registry.settings(
+        facts.kind,
+        name,
+        asked,
+        &mut report.sources,
+        &mut report.diagnostics,
+    )?;
+    let mut typer = Typer {
+        catalog,
+        registry: &mut registry,
+        sources: &mut report.sources,
+        diagnostics: &mut report.diagnostics,
+        traces: BTreeMap::new(),
+        beside: vec!["about", "extends"],
+        prefix: String::new(),
+    };
+    let value = typer.value(&facts.schema, &node, "")?;
+    (facts.normalize)(value).ok()
+}
+
 fn build(
     catalog: &Catalog,
     request: &Request,

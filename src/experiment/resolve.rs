@@ -16,6 +16,7 @@ use super::source::{Origin, Sources};
 use super::stage::{AnyOp, Arity, Port};
 use super::sweep;
 use super::typed::{Trace, Typer};
+use super::why;
 use super::yaml::{Data, Item, Node};
 use serde_json::Value;
 use std::collections::BTreeMap;
@@ -104,7 +105,10 @@ impl Resolver<'_> {
             return None;
         }
         let items = stages.map(Node::items).unwrap_or_default();
-        let mut graph = Graph::default();
+        let mut graph = Graph {
+            head: why::heads(&root),
+            ..Graph::default()
+        };
         let mut places = BTreeMap::new();
         let mut drafts: Vec<Option<Draft>> = Vec::new();
         for item in items {

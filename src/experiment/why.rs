@@ -2,9 +2,11 @@
 
 use super::catalog::Catalog;
 use super::docs;
-use super::graph::{Cell, Experiment, Stage};
+use super::graph::{Cell, Experiment, Head, Stage};
 use super::names;
 use super::source::Origin;
+use super::typed::Trace;
+use super::yaml::{Data, Node};
 use serde::Serialize;
 use serde_json::Value;
 use std::fmt::Write as _;
@@ -51,6 +53,10 @@ pub fn explain(
             names::suggest(arm, &arms).unwrap_or_default(),
         ));
     };
+    let answers = head(experiment, cell, key);
+    if !answers.is_empty() {
+        return Ok(answers);
+    }
     let short = key.strip_prefix("stages.").unwrap_or(key);
     let stage = cell
         .graph
@@ -63,7 +69,8 @@ pub fn explain(
         })
         .max_by_key(|stage| stage.name.len());
     let Some(stage) = stage else {
-        let known: Vec<&str> = cell.graph.stages.iter().map(|s| s.name.as_str()).collect();
+        let mut known: Vec<&str> = cell.graph.stages.iter().map(|s| s.name.as_str()).collect();
+        known.extend(["experiment", "about", "seed", "params"]);
         let wrong = short.split('.').next().unwrap_or(short);
         return Err((
             format!("`{key}` is in no stage"),
@@ -198,6 +205,63 @@ fn flatten(path: &str, value: &Value, into: &mut Vec<(String, String)>) {
         Value::String(text) => into.push((path.to_owned(), text.clone())),
         other => into.push((path.to_owned(), other.to_string())),
     }
+}
+
+/// The keys of an experiment beside its stages, with the layers that gave them.
+pub(super) fn heads(root: &Node) -> Vec<Head> {
+    fn collect(node: &Node, key: String, into: &mut Vec<Head>) {
+        if let Data::Map(items) = &node.data {
+            for item in items {
+                collect(&item.value, format!("{key}.{}", item.key), into);
+            }
+            return;
+        }
+        let earlier = std::iter::successors(node.before.as_deref(), |node| node.before.as_deref());
+        into.push(Head {
+            key,
+            value: node.inline(),
+            trace: Trace {
+                span: node.span,
+                before: earlier.map(|node| (node.span, node.inline())).collect(),
+            },
+        });
+    }
+    let mut heads = Vec::new();
+    for key in ["experiment", "about", "seed", "params"] {
+        if let Some(node) = root.get(key) {
+            collect(node, key.to_owned(), &mut heads);
+        }
+    }
+    heads
+}
+
+/// What `key` names beside the stages: one value, or all `params`.
+fn head(experiment: &Experiment, cell: &Cell, key: &str) -> Vec<Answer> {
+    let inside = format!("{key}.");
+    let links = |head: &Head| {
+        let places = std::iter::once((head.trace.span, head.value.clone()));
+        places
+            .chain(head.trace.before.clone())
+            .map(|(span, value)| Link {
+                value,
+                place: experiment.sources.cite(span),
+                layer: layer(experiment, cell, span.layer),
+            })
+            .collect()
+    };
+    let found = cell
+        .graph
+        .head
+        .iter()
+        .filter(|head| head.key == key || head.key.starts_with(&inside));
+    found
+        .map(|head| Answer {
+            key: head.key.clone(),
+            value: head.value.clone(),
+            about: String::new(),
+            chain: links(head),
+        })
+        .collect()
 }
 
 /// For people.

@@ -84,12 +84,8 @@ pub const FORMAT: u32 = 1;
 pub enum PredictionsError {
     #[error(transparent)]
     Format(#[from] FormatError),
-    #[error("{path}: {error}")]
-    Io {
-        path: String,
-        #[source]
-        error: std::io::Error,
-    },
+    #[error("{path}: {source}")]
+    Io { path: String, source: std::io::Error },
     #[error("{path}: {reason}")]
     Content { path: String, reason: String },
 }
@@ -97,7 +93,7 @@ pub enum PredictionsError {
 impl PredictionsError {
     fn io(path: &Path) -> impl FnOnce(std::io::Error) -> Self {
         let path = path.display().to_string();
-        move |error| Self::Io { path, error }
+        move |source| Self::Io { path, source }
     }
 
     fn content(path: &Path, reason: impl Into<String>) -> Self {

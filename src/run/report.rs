@@ -21,6 +21,8 @@ use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::path::Path;
 
+/// The comparison of a sweep's arms, beside the page.
+pub const TABLE: &str = "table.md";
 /// Larger pieces are named, not shown.
 const LARGEST_PIECE: u64 = 8 << 20;
 /// More plots than anyone looks at make a page slow.
@@ -34,6 +36,7 @@ pub fn write(directory: &RunDirectory) -> Result<(), RunError> {
     let mut page = String::new();
     head(&mut page, &run, &schedule, directory);
     stages(&mut page, &schedule, directory);
+    comparison(&mut page, directory);
     plots(&mut page, &schedule, directory, &cache)?;
     for work in &schedule.works {
         sections(&mut page, work, &schedule, &cache)?;
@@ -91,6 +94,16 @@ fn head(page: &mut String, run: &Run, schedule: &Schedule, directory: &RunDirect
         let _ = writeln!(page, "<tr><th>{name}</th><td>{}</td></tr>", escape(&value));
     }
     page.push_str("</table>\n");
+}
+
+/// The table of a sweep's `compare:` block, if it was written: it needs every arm.
+fn comparison(page: &mut String, directory: &RunDirectory) {
+    let path = directory.path().join("report").join(TABLE);
+    let small = std::fs::metadata(&path).is_ok_and(|meta| meta.len() <= LARGEST_PIECE);
+    if let (true, Ok(text)) = (small, std::fs::read_to_string(&path)) {
+        page.push_str("<h2>Comparison</h2>\n");
+        page.push_str(&html(&text));
+    }
 }
 
 fn stage_directory(directory: &RunDirectory, work: &Work) -> std::path::PathBuf {

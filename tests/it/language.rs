@@ -378,3 +378,30 @@ fn an_experiment_can_be_planned_where_its_data_is_not() {
     // To run it, the data must be there.
     assert!(folder.says("a.yaml", &[]).contains("error[E0601]"));
 }
+
+#[test]
+fn why_explains_what_stands_beside_the_stages() {
+    let text = TINY.replace("stages:\n", "params: {width: 8, deep: {er: 1}}\nstages:\n");
+    let folder = Folder::new(&[
+        ("tiny.yaml", &text),
+        (
+            "next.yaml",
+            "extends: tiny.yaml\nexperiment: next\nparams: {width: 16}\n",
+        ),
+    ]);
+    let experiment = folder.sound("next.yaml", &["params.width=32"]);
+    let why = |key: &str| reviv::experiment::why::explain(&catalog(), &experiment, None, key);
+    let width = why("params.width").unwrap().remove(0);
+    let values: Vec<&str> = width.chain.iter().map(|link| link.value.as_str()).collect();
+    assert_eq!(
+        (width.value.as_str(), values),
+        ("32", vec!["32", "16", "8"])
+    );
+    assert_eq!(width.chain[0].layer, "the command line");
+    assert_eq!(width.chain[1].layer, "the file");
+    let params: Vec<String> = why("params").unwrap().into_iter().map(|a| a.key).collect();
+    assert_eq!(params, ["params.width", "params.deep.er"]);
+    assert_eq!(why("experiment").unwrap()[0].chain[0].value, "next");
+    assert_eq!(why("seed").unwrap()[0].value, "7");
+    assert!(why("params.wide").is_err());
+}

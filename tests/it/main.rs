@@ -19,6 +19,7 @@ mod recordings_video;
 mod schema;
 mod shared;
 mod statistics;
+mod sweep_compare;
 mod train_mget;
 mod training;
 mod trajectories;

@@ -206,7 +206,10 @@ pub fn cell(arm: &str, seed: u64, numbers: Value, scale: f64) -> Cell {
     Cell {
         arm: arm.into(),
         seed,
-        graph: Graph { stages },
+        graph: Graph {
+            stages,
+            head: Vec::new(),
+        },
     }
 }
 

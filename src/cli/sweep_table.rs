@@ -1,0 +1,55 @@
+//! The `compare:` block of a sweep: `report/table.{md,tex,csv}` of its run, which the run's page shows.
+
+use super::compare::entrants_of;
+use super::terminal::Failure;
+use crate::evaluation::compare::{CompareSettings, IntervalSettings, compare};
+use crate::evaluation::published::Published;
+use crate::evaluation::render::{Format, render};
+use crate::evaluation::statistics::Over;
+use crate::experiment::catalog::Catalog;
+use crate::experiment::graph::Resample;
+use crate::experiment::{Compare, Experiment, load};
+use crate::run::{RunDirectory, files, report};
+
+/// Writes the table of a finished sweep and its page anew. Gives the table for the terminal.
+pub fn write(
+    catalog: &Catalog,
+    experiment: &Experiment,
+    asked: &Compare,
+    run: &RunDirectory,
+) -> Result<String, Failure> {
+    let entrants = entrants_of(&run.path().display().to_string(), run.runs())?;
+    let published: Option<Published> = asked
+        .against
+        .as_ref()
+        .and_then(|name| load::entry(catalog, &experiment.path, "published", name))
+        .and_then(|value| serde_json::from_value(value).ok());
+    let over = asked.interval.over.iter().map(|what| match what {
+        Resample::Seeds => Over::Seeds,
+        Resample::Clips => Over::Clips,
+    });
+    let settings = CompareSettings {
+        columns: asked.columns.clone(),
+        baseline: asked.baseline.clone(),
+        against: asked.against.clone(),
+        interval: IntervalSettings {
+            level: asked.interval.level,
+            over: over.collect(),
+            ..IntervalSettings::default()
+        },
+        ..CompareSettings::default()
+    };
+    let table = compare(&experiment.name, &entrants, &settings, published.as_ref())
+        .map_err(|error| Failure::input(error.to_string(), "see `compare:` of the sweep"))?;
+    let folder = run.path().join("report");
+    for (name, format) in [
+        (report::TABLE, Format::Markdown),
+        ("table.tex", Format::Latex),
+        ("table.csv", Format::Csv),
+    ] {
+        files::write(&folder.join(name), render(&table, format).as_bytes())
+            .map_err(Failure::machine)?;
+    }
+    report::write(run).map_err(Failure::machine)?;
+    Ok(render(&table, Format::Terminal))
+}
