@@ -29,6 +29,7 @@ fn main() {
     for (path, _) in catalog.experiments() {
         let request = Request {
             path: root.join(path),
+            data_may_be_absent: true,
             ..Request::default()
         };
         if let (Some(experiment), _) = load(&catalog, &request) {
@@ -48,6 +49,7 @@ fn main() {
     };
     let request = Request {
         path: path.clone(),
+        data_may_be_absent: true,
         ..Request::default()
     };
     println!("largest: {} ({stages} stages in all runs)", path.display());

@@ -85,7 +85,10 @@ pub enum PredictionsError {
     #[error(transparent)]
     Format(#[from] FormatError),
     #[error("{path}: {source}")]
-    Io { path: String, source: std::io::Error },
+    Io {
+        path: String,
+        source: std::io::Error,
+    },
     #[error("{path}: {reason}")]
     Content { path: String, reason: String },
 }

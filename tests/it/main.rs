@@ -18,6 +18,7 @@ mod recordings_golden;
 mod recordings_video;
 mod schema;
 mod shared;
+mod shipped;
 mod statistics;
 mod sweep_compare;
 mod train_mget;
