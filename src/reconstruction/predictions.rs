@@ -26,6 +26,7 @@ use crate::formats::npz::Npz;
 use ndarray::{Array1, Ix1};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
+use std::io;
 use std::path::{Path, PathBuf};
 
 /// The index of a folder of predictions.
@@ -85,16 +86,13 @@ pub enum PredictionsError {
     #[error(transparent)]
     Format(#[from] FormatError),
     #[error("{path}: {source}")]
-    Io {
-        path: String,
-        source: std::io::Error,
-    },
+    Io { path: String, source: io::Error },
     #[error("{path}: {reason}")]
     Content { path: String, reason: String },
 }
 
 impl PredictionsError {
-    fn io(path: &Path) -> impl FnOnce(std::io::Error) -> Self {
+    fn io(path: &Path) -> impl FnOnce(io::Error) -> Self {
         let path = path.display().to_string();
         move |source| Self::Io { path, source }
     }

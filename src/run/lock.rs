@@ -100,6 +100,13 @@ impl Lock {
     }
 }
 
+impl Drop for Lock {
+    /// Closing the file is not enough: a process that is just being started has a copy of it for a moment.
+    fn drop(&mut self) {
+        let _ = self.file.unlock();
+    }
+}
+
 /// Whether a process holds the lock right now.
 pub fn is_held(path: &Path) -> bool {
     let Ok(file) = File::open(path) else {
