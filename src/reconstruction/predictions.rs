@@ -25,9 +25,8 @@ use crate::formats::FormatError;
 use crate::formats::npz::Npz;
 use ndarray::{Array1, Ix1};
 use serde::{Deserialize, Serialize};
-use std::collections::BTreeMap;
-use std::io;
 use std::path::{Path, PathBuf};
+use std::{collections::BTreeMap, io};
 
 /// The index of a folder of predictions.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
