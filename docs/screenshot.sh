@@ -1,0 +1,10 @@
+#!/usr/bin/env bash
+# Makes docs/view.png: the page of the quickstart's reconstruction, in headless Chromium.
+# Usage: docs/screenshot.sh [RUN]; without a run, the latest of the quickstart.
+set -eu
+cd "$(dirname "$0")/.."
+run=${1:-$(ls -td runs/*-quickstart-*/ | head -n 1)}
+page=$(cargo run --release --quiet -- view "$run")
+browser=$(command -v chromium || command -v chromium-browser || command -v google-chrome)
+"$browser" --headless --no-sandbox --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader \
+    --window-size=1280,800 --virtual-time-budget=8000 --screenshot=docs/view.png "file://$(realpath "$page")#t=1.0"
