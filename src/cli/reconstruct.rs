@@ -6,6 +6,7 @@ use super::terminal::{Failure, Terminal};
 use crate::experiment::catalog::Catalog;
 use crate::experiment::load::Request;
 use crate::reconstruction::folder::{FOLDER, Manifest, PAGE};
+use crate::reconstruction::predictions::ScaleStatus;
 use crate::run::execute::{Job, Outcome, cache_of, execute};
 use crate::run::schedule::Schedule;
 use crate::run::{Interrupt, RunDirectory, RunError, Shard, State, files, metrics};
@@ -189,7 +190,9 @@ impl Reconstruct {
         for [label, value] in &manifest.assumptions {
             let _ = writeln!(text, "{label:<12}{value}");
         }
-        let _ = writeln!(text, "{:<12}{}", "Depth", manifest.scale.words());
+        if manifest.scale != ScaleStatus::None {
+            let _ = writeln!(text, "{:<12}{}", "Depth", manifest.scale.words());
+        }
         if let Some(reason) = &manifest.refused {
             let _ = writeln!(text, "{:<12}no metric scale: {reason}", "");
         }

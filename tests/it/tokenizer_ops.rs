@@ -23,7 +23,8 @@ stages:
     clips: clips
     modality: camera
     tokenizer: {use: vq_temporal_small, codebook: 16, width: 16, depth: 1, heads: 2}
-    steps: 60
+    steps: 150
+    rate: 0.003
     warmup: 5
     checkpoint_every: 20
   tok_left_hand:

@@ -9,9 +9,12 @@ use crate::modality::ClipFormat;
 use crate::reconstruction::lens::{LensError, LensSettings};
 use crate::reconstruction::windows::Window;
 use crate::source::SourceError;
-use crate::source::video::Video;
+use crate::source::image::Image;
+use crate::source::video::{self, Video};
 use crate::view::Fact;
 use crate::view::scene::{Badge, Tone};
+use ndarray::Array4;
+use std::collections::BTreeMap;
 use std::fmt::Display;
 
 /// Seconds of a clip.
@@ -33,6 +36,16 @@ pub(super) struct Recording {
 enum Frames {
     Video { video: Video, start: f64 },
     Clip(Rgb),
+}
+
+/// The frames of one window after the other. A frame that several windows need is decoded once, and kept no longer than needed.
+pub(super) struct Stream<'a> {
+    /// Frames of the video, by window.
+    chosen: Vec<Vec<usize>>,
+    decoded: Option<video::Frames>,
+    held: BTreeMap<usize, Image>,
+    clip: Option<&'a Rgb>,
+    format: &'a ClipFormat,
 }
 
 impl Recording {
@@ -202,17 +215,68 @@ impl Recording {
         })
     }
 
-    /// The frames of a window, as the model takes them.
-    pub fn frames(&self, window: &Window, format: &ClipFormat) -> Result<Rgb, StageError> {
-        match &self.frames {
-            Frames::Clip(rgb) => Ok(rgb.clone()),
+    /// The frames of these windows, as the model takes them.
+    pub fn stream<'a>(
+        &'a self,
+        windows: &[Window],
+        format: &'a ClipFormat,
+    ) -> Result<Stream<'a>, StageError> {
+        let (chosen, decoded, clip) = match &self.frames {
+            Frames::Clip(rgb) => (Vec::new(), None, Some(rgb)),
             Frames::Video { video, start } => {
-                let first = video.schedule().nearest(start + window.start_seconds());
-                video
-                    .load_clip(first, format.video_rate, format.frames, format.size as u32)
-                    .map_err(|error| unreadable(&error))
+                let schedule = video.schedule();
+                let of = |window: &Window| {
+                    let first = schedule.nearest(start + window.start_seconds());
+                    schedule.clip(first, format.video_rate, format.frames)
+                };
+                let chosen: Vec<Vec<usize>> = windows.iter().map(of).collect();
+                let decoded = video
+                    .chosen(chosen.concat())
+                    .map_err(|error| unreadable(&error))?;
+                (chosen, Some(decoded), None)
             }
+        };
+        Ok(Stream {
+            chosen,
+            decoded,
+            held: BTreeMap::new(),
+            clip,
+            format,
+        })
+    }
+}
+
+impl Stream<'_> {
+    /// The frames of a window; windows are asked for in their order.
+    pub fn window(&mut self, index: usize) -> Result<Rgb, StageError> {
+        if let Some(clip) = self.clip {
+            return Ok(clip.clone());
         }
+        let chosen = &self.chosen[index];
+        let first = chosen.iter().min().copied().unwrap_or(0);
+        self.held.retain(|frame, _| *frame >= first);
+        let side = self.format.size;
+        let mut frames = Array4::zeros((chosen.len(), side, side, 3));
+        for (mut slot, wanted) in frames.outer_iter_mut().zip(chosen) {
+            while !self.held.contains_key(wanted) {
+                let frame = self.decoded.as_mut().and_then(Iterator::next);
+                let frame = frame
+                    .ok_or_else(|| {
+                        input(
+                            format_args!("the video ends before its frame {wanted}"),
+                            "check the file, or convert it with `ffmpeg`",
+                        )
+                    })?
+                    .map_err(|error| unreadable(&error))?;
+                self.held
+                    .insert(frame.index, frame.image.square(side as u32));
+            }
+            slot.assign(&video::to_array(&self.held[wanted]));
+        }
+        Ok(Rgb {
+            rate: self.format.video_rate,
+            frames,
+        })
     }
 }
 

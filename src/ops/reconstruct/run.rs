@@ -80,7 +80,7 @@ pub(super) fn run(
     assumptions.push(Fact {
         label: "Decoding".into(),
         value: format!(
-            "`{}`, seed {}, {} windows of 2 s, {} s in common",
+            "`{}`, seed {}, windows of 2 s ({}), {} s in common",
             settings.decoding.name,
             context.seed(),
             list.len(),
@@ -114,11 +114,12 @@ pub(super) fn run(
         decoding: &settings.decoding.settings,
         seed: context.seed(),
     };
+    let mut stream = recording.stream(&list, &format)?;
     for window in &list {
         if context.interrupted() {
             return Err(StageError::Interrupted);
         }
-        let rgb = times.take("read the video", || recording.frames(window, &format))?;
+        let rgb = times.take("read the video", || stream.window(window.index))?;
         let mut clip = Clip::empty(format!("{}/{:06}", recording.title, window.index), "video");
         clip.rgb = Some(rgb.clone());
         let made = times
