@@ -1,4 +1,4 @@
-//! Our folder of a model: which file every part becomes, as [`crate::mget::Mget::open`] and [`crate::tokenizer::open`] read
+//! Our folder of a model: which file every part becomes, as [`crate::mget::Mget::open`] and [`crate::tokenizer::open()`] read
 //! it.
 //!
 //! ```text

@@ -22,7 +22,7 @@ pub(super) struct Inspect {
     /// A recording, a video, a data set, converted clips, an artifact of the op `clips`, or a registry source (`world`)
     #[arg(value_name = "PATH|SOURCE")]
     path: PathBuf,
-    /// The folder of the pictures [default: `inspect-<name>`]
+    /// The folder of the pictures (otherwise `inspect-<name>`)
     #[arg(short, long, value_name = "DIR")]
     output: Option<PathBuf>,
     #[command(flatten)]

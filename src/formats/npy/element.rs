@@ -19,7 +19,7 @@ pub enum Dtype {
     F64,
 }
 
-/// The elements of an [`NpyArray`].
+/// The elements of an [`super::NpyArray`].
 #[derive(Debug, Clone, PartialEq)]
 pub enum NpyData {
     Bool(Vec<bool>),
