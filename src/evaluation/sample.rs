@@ -1,6 +1,7 @@
 //! Drawing a benchmark's clips ("3,000 random clips") so that anyone draws the same: by SHA-256 of `seed/clip_id`.
 
 use serde::{Deserialize, Serialize};
+use sha2::{Digest, Sha256};
 
 /// How many clips, and which.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
@@ -34,75 +35,9 @@ impl Sample {
     }
 }
 
-/// SHA-256 (FIPS 180-4). The protocol names this hash; the rest of the program uses blake3.
+/// The protocol names this hash; the rest of the program uses blake3.
 fn sha256(message: &[u8]) -> [u8; 32] {
-    let primes: Vec<u32> = (2_u32..312)
-        .filter(|n| (2..*n).all(|d| n % d != 0))
-        .collect();
-    // The first 32 bits of the fractional parts of the cube (and square) roots of the primes.
-    let fraction = |root: f64| (root.fract() * 4_294_967_296.0) as u32;
-    let constants: Vec<u32> = primes
-        .iter()
-        .map(|&p| fraction(f64::from(p).cbrt()))
-        .collect();
-    let mut state: Vec<u32> = primes[..8]
-        .iter()
-        .map(|&p| fraction(f64::from(p).sqrt()))
-        .collect();
-
-    let mut padded = message.to_vec();
-    padded.push(0x80);
-    while padded.len() % 64 != 56 {
-        padded.push(0);
-    }
-    padded.extend((message.len() as u64 * 8).to_be_bytes());
-
-    for block in padded.chunks_exact(64) {
-        let mut w = [0_u32; 64];
-        for (slot, bytes) in w.iter_mut().zip(block.chunks_exact(4)) {
-            *slot = u32::from_be_bytes([bytes[0], bytes[1], bytes[2], bytes[3]]);
-        }
-        for i in 16..64 {
-            let s0 = w[i - 15].rotate_right(7) ^ w[i - 15].rotate_right(18) ^ (w[i - 15] >> 3);
-            let s1 = w[i - 2].rotate_right(17) ^ w[i - 2].rotate_right(19) ^ (w[i - 2] >> 10);
-            w[i] = w[i - 16]
-                .wrapping_add(s0)
-                .wrapping_add(w[i - 7])
-                .wrapping_add(s1);
-        }
-        let mut v: [u32; 8] = [0; 8];
-        v.copy_from_slice(&state);
-        for i in 0..64 {
-            let s1 = v[4].rotate_right(6) ^ v[4].rotate_right(11) ^ v[4].rotate_right(25);
-            let choice = (v[4] & v[5]) ^ (!v[4] & v[6]);
-            let t1 = v[7]
-                .wrapping_add(s1)
-                .wrapping_add(choice)
-                .wrapping_add(constants[i])
-                .wrapping_add(w[i]);
-            let s0 = v[0].rotate_right(2) ^ v[0].rotate_right(13) ^ v[0].rotate_right(22);
-            let majority = (v[0] & v[1]) ^ (v[0] & v[2]) ^ (v[1] & v[2]);
-            let t2 = s0.wrapping_add(majority);
-            v = [
-                t1.wrapping_add(t2),
-                v[0],
-                v[1],
-                v[2],
-                v[3].wrapping_add(t1),
-                v[4],
-                v[5],
-                v[6],
-            ];
-        }
-        for (s, v) in state.iter_mut().zip(v) {
-            *s = s.wrapping_add(v);
-        }
-    }
-    let mut digest = [0; 32];
-    for (out, word) in digest.chunks_exact_mut(4).zip(state) {
-        out.copy_from_slice(&word.to_be_bytes());
-    }
-    digest
+    Sha256::digest(message).into()
 }
 
 #[cfg(test)]

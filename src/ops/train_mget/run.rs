@@ -9,6 +9,7 @@ use crate::mget::Mget;
 use crate::modality::ClipFormat;
 use crate::run::checkpoint;
 use crate::run::environment::Stopwatch;
+use crate::run::files::copy_tree;
 use crate::training::{
     DataError, Feed, Loader, Order, Score, Shards, StepReport, TokenSource, Trainer, TrainingError,
     TrainingSettings, Unigram, Validation,
@@ -16,7 +17,6 @@ use crate::training::{
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
-use std::path::Path;
 use std::sync::Arc;
 
 /// The file of held-out losses.
@@ -295,7 +295,7 @@ impl Run {
         let path = report.join("validation.md");
         std::fs::write(&path, self.table(scores)).map_err(StageError::io(&path))?;
         if let Some(tokenizers) = &self.tokenizers {
-            copy(tokenizers, &output.join(TOKENIZERS))?;
+            copy_tree(tokenizers, &output.join(TOKENIZERS)).map_err(StageError::other)?;
         }
         if let Some(clips) = self.clips {
             let binding = Binding::of(&output, clips).map_err(StageError::other)?;
@@ -317,22 +317,4 @@ fn damaged(reason: &str) -> StageError {
         message: format!("the tokens artifact cannot be used: {reason}"),
         help: "run the stage that makes it again".into(),
     }
-}
-
-/// Copies a folder.
-fn copy(from: &Path, to: &Path) -> Result<(), StageError> {
-    std::fs::create_dir_all(to).map_err(StageError::io(to))?;
-    for entry in std::fs::read_dir(from).map_err(StageError::io(from))? {
-        let path = entry.map_err(StageError::io(from))?.path();
-        let Some(name) = path.file_name() else {
-            continue;
-        };
-        let target = to.join(name);
-        if path.is_dir() {
-            copy(&path, &target)?;
-        } else {
-            std::fs::copy(&path, &target).map_err(StageError::io(&path))?;
-        }
-    }
-    Ok(())
 }
