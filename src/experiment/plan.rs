@@ -1,7 +1,7 @@
 //! What running an experiment would do: every different stage once, what its cells share, what is cached already.
 
 use super::artifact::{ArtifactKind, Description};
-use super::graph::{ArtifactKey, Experiment};
+use super::graph::{ArtifactKey, Experiment, Graph, Stage};
 use super::stage::StagePlan;
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -59,6 +59,8 @@ impl Plan {
 
 /// Plans an experiment: no compute, no allocation of a model.
 ///
+/// Stages that differ in their seed alone have the same plan, which is made once.
+///
 /// `cached` says whether an artifact is there; `hash_file` hashes outside files.
 ///
 /// # Errors
@@ -70,6 +72,7 @@ pub fn plan(
 ) -> std::io::Result<Plan> {
     let mut stages: Vec<PlannedStage> = Vec::new();
     let mut seen: BTreeMap<String, usize> = BTreeMap::new();
+    let mut answers: BTreeMap<String, StagePlan> = BTreeMap::new();
     let mut total = 0;
     for (index, cell) in experiment.cells.iter().enumerate() {
         let keys = cell.graph.keys(hash_file)?;
@@ -91,7 +94,10 @@ pub fn plan(
                 cached: cached(&key),
                 cells: vec![index],
                 description: stage.description.clone(),
-                plan: cell.graph.plan(stage),
+                plan: answers
+                    .entry(question(&cell.graph, stage))
+                    .or_insert_with(|| cell.graph.plan(stage))
+                    .clone(),
             });
         }
     }
@@ -101,4 +107,18 @@ pub fn plan(
         stages,
         total,
     })
+}
+
+/// Everything that the plan of a stage depends on.
+fn question(graph: &Graph, stage: &Stage) -> String {
+    let edges = stage.edges.iter().map(|edge| {
+        let descriptions: Vec<&Description> = edge
+            .from
+            .iter()
+            .map(|&index| &graph.stages[index].description)
+            .collect();
+        (edge.port, descriptions)
+    });
+    let edges: Vec<_> = edges.collect();
+    serde_json::json!([stage.op.name(), stage.settings, edges]).to_string()
 }

@@ -181,7 +181,7 @@ pub trait Op: Send + Sync + 'static {
     ) -> Description;
 
     /// What the stage will be: called only when `check` found no error. No compute beyond a seeded simulation of
-    /// milliseconds, no allocation of a model.
+    /// milliseconds, no allocation of a model. `seed` is for such a simulation: the same for every stage, not the stage's own.
     fn plan(&self, _settings: &Self::Settings, _inputs: &Inputs<'_>, _seed: u64) -> StagePlan {
         StagePlan::default()
     }

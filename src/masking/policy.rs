@@ -160,6 +160,42 @@ impl Masking {
         mask
     }
 
+    /// Token counts of one sample under the uniform policy, visible and target: distributed as those of [`Self::draw`], from
+    /// other random numbers and without the positions.
+    pub(super) fn pooled_counts(
+        &self,
+        present: &[bool],
+        rng: &mut StreamRng,
+    ) -> (Vec<usize>, Vec<usize>) {
+        let component = self.component(rng);
+        let inputs = draw_total(self.settings.input_tokens, rng);
+        let targets = draw_total(self.settings.target_tokens, rng);
+        let mut left: Vec<usize> = self.slots.iter().map(|slot| slot.tokens).collect();
+        let mut side = |table: &[Vec<f64>], total: usize| {
+            let takes_part = |slot: usize| present[slot] && table[component][slot] > 0.0;
+            let pool: usize = (0..left.len())
+                .filter(|s| takes_part(*s))
+                .map(|s| left[s])
+                .sum();
+            let mut counts = vec![0; left.len()];
+            for taken in 0..total.min(pool) {
+                let mut pick = rng.random_range(0..pool - taken);
+                for slot in (0..left.len()).filter(|slot| takes_part(*slot)) {
+                    if pick < left[slot] {
+                        left[slot] -= 1;
+                        counts[slot] += 1;
+                        break;
+                    }
+                    pick -= left[slot];
+                }
+            }
+            counts
+        };
+        let input = side(&self.resolved.input, inputs);
+        let target = side(&self.resolved.target, targets);
+        (input, target)
+    }
+
     /// Positions from all tokens pooled: first the visible ones, then targets from what is left.
     fn pooled(&self, present: &[bool], rng: &mut StreamRng) -> Mask {
         let component = self.component(rng);

@@ -121,6 +121,28 @@ fn the_papers_models_have_the_papers_parameters() {
     assert_eq!(mget["plan"]["work"][0], steps);
 }
 
+/// What masking does on average belongs to its settings: not to a training seed, nor to which arm is planned first.
+#[test]
+fn stages_with_the_same_masking_have_the_same_simulated_tokens() {
+    let sweep = plan("experiments/ablation_tiny.yaml");
+    let cells = sweep["cells"].as_array().unwrap();
+    let tokens = |arm: &str, seed: u64| {
+        let label = format!("{arm}-s{seed}");
+        let cell = cells.iter().position(|cell| *cell == label).unwrap();
+        let mut stages = sweep["stages"].as_array().unwrap().iter();
+        let uses = |stage: &&Value| stage["cells"].as_array().unwrap().contains(&cell.into());
+        stages
+            .find(|stage| stage["op"] == "train_mget" && uses(stage))
+            .unwrap()["plan"]["tokens"]
+            .clone()
+    };
+    for arm in ["full", "uniform", "body_specialist"] {
+        assert_eq!(tokens(arm, 0), tokens(arm, 2), "{arm}");
+    }
+    assert_eq!(tokens("full", 1), tokens("half_data", 1));
+    assert_ne!(tokens("full", 1), tokens("uniform", 1));
+}
+
 #[test]
 fn the_papers_tokenizers_have_the_papers_parameters() {
     for (file, expected) in [
