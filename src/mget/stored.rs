@@ -29,6 +29,28 @@ pub enum StoredError {
     Weights(#[from] EngineError),
 }
 
+/// Reads what the model in a directory is, without its weights.
+///
+/// # Errors
+/// When the file is missing, too large or of another form.
+pub fn read_spec(directory: &Path) -> Result<MgetSpec, StoredError> {
+    let path = directory.join(SPEC);
+    let file = |reason: String| StoredError::File {
+        path: path.clone(),
+        reason,
+    };
+    let length = std::fs::metadata(&path)
+        .map_err(|error| file(error.to_string()))?
+        .len();
+    if length > MAX_SPEC {
+        return Err(file(format!(
+            "{length} bytes are too many for a description of a model"
+        )));
+    }
+    let text = std::fs::read(&path).map_err(|error| file(error.to_string()))?;
+    serde_json::from_slice(&text).map_err(|error| file(error.to_string()))
+}
+
 impl Mget {
     /// Writes the model into a directory.
     ///
@@ -51,21 +73,7 @@ impl Mget {
     /// When a file is missing or damaged, or the two do not belong together.
     pub fn open(directory: &Path, compute: &Compute) -> Result<Self, StoredError> {
         let path = directory.join(SPEC);
-        let file = |reason: String| StoredError::File {
-            path: path.clone(),
-            reason,
-        };
-        let length = std::fs::metadata(&path)
-            .map_err(|error| file(error.to_string()))?
-            .len();
-        if length > MAX_SPEC {
-            return Err(file(format!(
-                "{length} bytes are too many for a description of a model"
-            )));
-        }
-        let text = std::fs::read(&path).map_err(|error| file(error.to_string()))?;
-        let spec: MgetSpec =
-            serde_json::from_slice(&text).map_err(|error| file(error.to_string()))?;
+        let spec = read_spec(directory)?;
         let weights = Weights::read(&directory.join(WEIGHTS))?;
         // The file has every table in full: a description that asks for more than is there is refused before it is built.
         for (name, shape) in spec.parameters() {

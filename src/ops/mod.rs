@@ -3,6 +3,7 @@
 mod clip_signals;
 pub mod clips;
 mod evaluate;
+mod import;
 mod kinds;
 mod predict;
 mod reconstruct;

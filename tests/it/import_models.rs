@@ -222,7 +222,7 @@ fn an_imported_video_tokenizer_reproduces_every_number_of_the_reference() {
 }
 
 /// A set of small dimensions that takes clips of 16 x 16 pixels.
-fn small_set(folder: &Path, with_main: bool) {
+pub fn small_set(folder: &Path, with_main: bool) {
     let size = Size {
         width: 24,
         heads: 6,

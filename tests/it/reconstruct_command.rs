@@ -123,12 +123,13 @@ fn pictures(folder: &Path, frames: usize, [width, height]: [u32; 2], black: bool
     }
 }
 
-struct Place {
+/// A folder with a model in it.
+pub struct Place {
     root: tempfile::TempDir,
 }
 
 impl Place {
-    fn new() -> Self {
+    pub fn new() -> Self {
         let place = Self {
             root: tempfile::tempdir().unwrap(),
         };
@@ -136,11 +137,11 @@ impl Place {
         place
     }
 
-    fn path(&self, name: &str) -> std::path::PathBuf {
+    pub fn path(&self, name: &str) -> std::path::PathBuf {
         self.root.path().join(name)
     }
 
-    fn command(&self, video: &str, output: &str) -> Command {
+    pub fn command(&self, video: &str, output: &str) -> Command {
         let mut command = Command::new(env!("CARGO_BIN_EXE_reviv"));
         command.current_dir(self.root.path()).args([
             "reconstruct",
@@ -154,7 +155,7 @@ impl Place {
     }
 
     /// Runs it and gives what it said, which must hold `words`.
-    fn refuses(&self, video: &str, words: &str) {
+    pub fn refuses(&self, video: &str, words: &str) {
         let output = self.command(video, "refused").assert().code(1);
         let said = String::from_utf8_lossy(&output.get_output().stderr).into_owned();
         assert!(said.contains(words), "{words:?} is not in:\n{said}");
