@@ -1,6 +1,6 @@
 //! From a path to an [`Experiment`]: reads the layers, composes them, opens a sweep into its cells and resolves each.
 
-use super::catalog::Catalog;
+use super::catalog::{Catalog, KindFacts};
 use super::compose::Composer;
 use super::data;
 use super::diagnostic::{Diagnostic, Report, Span};
@@ -89,31 +89,7 @@ pub fn check(catalog: &Catalog, request: &Request) -> (Option<Experiment>, Repor
     let mut registry = Registry::new(catalog, None);
     registry.put(kind.kind, name, layer, &text, &request.path);
     let span = Span::point(layer, 0);
-    let node = registry.settings(
-        kind.kind,
-        name,
-        span,
-        &mut report.sources,
-        &mut report.diagnostics,
-    );
-    if let Some(node) = node {
-        let mut typer = Typer {
-            catalog,
-            registry: &mut registry,
-            sources: &mut report.sources,
-            diagnostics: &mut report.diagnostics,
-            traces: BTreeMap::new(),
-            beside: vec!["about", "extends"],
-            prefix: String::new(),
-        };
-        if let Some(value) = typer.value(&kind.schema, &node, "")
-            && let Err(error) = (kind.normalize)(value)
-        {
-            report
-                .diagnostics
-                .push(Diagnostic::new(Code::E0202, span, error.to_string()));
-        }
-    }
+    entry_settings(catalog, &mut registry, kind, name, span, &mut report);
     report.tidy();
     (None, report)
 }
@@ -130,24 +106,36 @@ pub fn entry(catalog: &Catalog, path: &Path, kind: &str, name: &str) -> Option<s
         origin: Origin::File,
     });
     let asked = Span::point(layer, 0);
-    let node = registry.settings(
-        facts.kind,
-        name,
-        asked,
-        &mut report.sources,
-        &mut report.diagnostics,
-    )?;
+    entry_settings(catalog, &mut registry, facts, name, asked, &mut report)
+}
+
+/// The settings of an entry, every default filled in; `None` after a report.
+fn entry_settings(
+    catalog: &Catalog,
+    registry: &mut Registry,
+    kind: &KindFacts,
+    name: &str,
+    asked: Span,
+    report: &mut Report,
+) -> Option<serde_json::Value> {
+    let (sources, diagnostics) = (&mut report.sources, &mut report.diagnostics);
+    let node = registry.settings(kind.kind, name, asked, sources, diagnostics)?;
     let mut typer = Typer {
         catalog,
-        registry: &mut registry,
-        sources: &mut report.sources,
-        diagnostics: &mut report.diagnostics,
+        registry,
+        sources,
+        diagnostics,
         traces: BTreeMap::new(),
         beside: vec!["about", "extends"],
         prefix: String::new(),
     };
-    let value = typer.value(&facts.schema, &node, "")?;
-    (facts.normalize)(value).ok()
+    let value = typer.value(&kind.schema, &node, "")?;
+    (kind.normalize)(value)
+        .map_err(|error| {
+            let refused = Diagnostic::new(Code::E0202, asked, error.to_string());
+            report.diagnostics.push(refused);
+        })
+        .ok()
 }
 
 fn build(
