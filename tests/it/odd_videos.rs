@@ -195,10 +195,7 @@ fn a_movie_that_ends_early_is_refused_with_the_place() {
     let bytes = Movie::new([32, 32], 30, pictures).bytes();
     let folder = Folder::new();
     let whole = open(&folder.file("whole.mp4", &bytes)).unwrap();
-    assert_eq!(
-        whole.frames(0..40).unwrap().filter(Result::is_ok).count(),
-        40
-    );
+    assert_eq!(whole.frames(0..40).unwrap().map(Result::unwrap).count(), 40);
     // Inside the media, inside the index, inside the first box.
     for keep in [bytes.len() - 1, bytes.len() / 2, 700, 200, 20, 5, 0] {
         let path = folder.file("cut.mp4", &bytes[..keep]);

@@ -43,7 +43,7 @@ impl Movie {
     /// The file, with its index in front of the media.
     pub fn bytes(&self) -> Vec<u8> {
         let samples: Vec<Vec<u8>> = self.samples();
-        let head = container(b"ftyp", &[b"isom\0\0\x02\0isomiso2avc1mp41"]);
+        let head = container(*b"ftyp", &[b"isom\0\0\x02\0isomiso2avc1mp41"]);
         let length = self.index(&samples, 0).len();
         let first = (head.len() + length + 8) as u32;
         let mut file = head;
@@ -178,8 +178,8 @@ impl Movie {
         entry[75] = 24;
         entry[76..78].copy_from_slice(&[0xff, 0xff]);
         let entry = container(
-            b"avc1",
-            &[&entry, &container(b"avcC", &[&self.configuration()])],
+            *b"avc1",
+            &[&entry, &container(*b"avcC", &[&self.configuration()])],
         );
         let words =
             |values: &[u32]| -> Vec<u8> { values.iter().flat_map(|v| v.to_be_bytes()).collect() };
@@ -195,25 +195,25 @@ impl Movie {
             }
         }
         let table = container(
-            b"stbl",
+            *b"stbl",
             &[
-                &container(b"stsd", &[&words(&[0, 1]), &entry]),
-                &container(b"stts", &[&words(&times)]),
-                &container(b"stss", &[&words(&starts)]),
-                &container(b"stsc", &[&words(&[0, 1, 1, count.max(1), 1])]),
-                &container(b"stsz", &[&words(&sizes)]),
-                &container(b"stco", &[&words(&[0, 1, first])]),
+                &container(*b"stsd", &[&words(&[0, 1]), &entry]),
+                &container(*b"stts", &[&words(&times)]),
+                &container(*b"stss", &[&words(&starts)]),
+                &container(*b"stsc", &[&words(&[0, 1, 1, count.max(1), 1])]),
+                &container(*b"stsz", &[&words(&sizes)]),
+                &container(*b"stco", &[&words(&[0, 1, first])]),
             ],
         );
         let location = container(
-            b"dref",
-            &[&words(&[0, 1]), &container(b"url ", &[&[0, 0, 0, 1]])],
+            *b"dref",
+            &[&words(&[0, 1]), &container(*b"url ", &[&[0, 0, 0, 1]])],
         );
         let information = container(
-            b"minf",
+            *b"minf",
             &[
-                &container(b"vmhd", &[&[0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0]]),
-                &container(b"dinf", &[&location]),
+                &container(*b"vmhd", &[&[0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0]]),
+                &container(*b"dinf", &[&location]),
                 &table,
             ],
         );
@@ -221,10 +221,10 @@ impl Movie {
         handler.extend(self.handler);
         handler.extend([0; 13]);
         let media = container(
-            b"mdia",
+            *b"mdia",
             &[
-                &container(b"mdhd", &[&words(&[0, 0, 0, self.timescale, total, 0])]),
-                &container(b"hdlr", &[&handler]),
+                &container(*b"mdhd", &[&words(&[0, 0, 0, self.timescale, total, 0])]),
+                &container(*b"hdlr", &[&handler]),
                 &information,
             ],
         );
@@ -237,7 +237,7 @@ impl Movie {
         };
         let matrix = words(&matrix.map(|value: i32| value as u32));
         let track = container(
-            b"tkhd",
+            *b"tkhd",
             &[
                 &words(&[7, 0, 0, 1, 0, total, 0, 0, 0, 0]),
                 &matrix,
@@ -245,7 +245,7 @@ impl Movie {
             ],
         );
         let movie = container(
-            b"mvhd",
+            *b"mvhd",
             &[
                 &words(&[
                     0,
@@ -262,12 +262,12 @@ impl Movie {
                 &words(&[0, 0, 0, 0, 0, 0, 2]),
             ],
         );
-        container(b"moov", &[&movie, &container(b"trak", &[&track, &media])])
+        container(*b"moov", &[&movie, &container(*b"trak", &[&track, &media])])
     }
 }
 
 /// A box.
-fn container(kind: &[u8; 4], parts: &[&[u8]]) -> Vec<u8> {
+fn container(kind: [u8; 4], parts: &[&[u8]]) -> Vec<u8> {
     let size = 8 + parts.iter().map(|part| part.len()).sum::<usize>();
     let mut bytes = (size as u32).to_be_bytes().to_vec();
     bytes.extend(kind);
