@@ -7,6 +7,7 @@ pub mod quantizer;
 pub mod trained;
 pub mod video;
 pub mod vq;
+pub mod whitening;
 
 pub use open::{open, open_on};
 

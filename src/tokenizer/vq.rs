@@ -11,8 +11,9 @@ use serde::{Deserialize, Serialize};
 use super::TokenizerError;
 use super::patches::Patches;
 use super::quantizer::{Assignment, Quantizer, QuantizerSettings};
+use super::whitening::{Whitening, scale};
 use crate::engine::parameters::to_host;
-use crate::engine::{Initialise, Parameter, Segments, ops, parameters};
+use crate::engine::{Initialise, Parameter, Parameters, Segments, ops, parameters};
 use crate::modality::Shape;
 use crate::nn::positions::{self, GridOrder};
 use crate::nn::{Block, LayerNorm, Linear, Mlp};
@@ -123,6 +124,9 @@ impl VqSettings {
         }
     }
 }
+
+/// What the ends of residual branches and the output are multiplied by before training.
+const QUIET: f32 = 0.1;
 
 /// A linear map stored as a convolution whose kernel covers its input.
 #[derive(Debug, Clone)]
@@ -425,6 +429,30 @@ impl VqVae {
                 square_NP.sum() / batch.valid.max(1.0)
             }
         }
+    }
+
+    /// Prepares a new model for training, fitted to `batches`, some of what it will train on: residual branches and the output
+    /// start quiet, latents are white and of length 1, about, as the codes are. The reference does without.
+    ///
+    /// # Errors
+    /// When there are no latents, or one is not finite.
+    pub fn calibrate(&mut self, batches: &[Batch]) -> Result<(), TokenizerError> {
+        let mut weights = self.weights();
+        scale(&mut weights, QUIET, |name| {
+            [".attn.proj.", "mlp.fc2.", "decoder.out_proj."]
+                .iter()
+                .any(|part| name.contains(part))
+        });
+        self.load(&weights)
+            .map_err(|error| TokenizerError::Other(error.to_string()))?;
+        let mut latents = Whitening::new(self.settings.code_width);
+        for batch in batches {
+            latents.add(&to_host(self.latents(self.encode_hidden(batch))));
+        }
+        let spread = (self.settings.code_width as f64).powf(-0.5);
+        latents.apply(&mut weights, "quant_proj", spread)?;
+        self.load(&weights)
+            .map_err(|error| TokenizerError::Other(error.to_string()))
     }
 
     /// One forward pass with straight-through codes: gradients pass the codebook as if it were not there, and the commitment

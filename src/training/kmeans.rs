@@ -9,17 +9,70 @@ use crate::tokenizer::patches::Patches;
 use crate::tokenizer::trained::Prepared;
 
 /// Patches that centres are fitted on, at most.
-const PATCHES: usize = 1 << 15;
+pub(super) const PATCHES: usize = 1 << 15;
 
 /// Rounds of Lloyd's algorithm.
-const ROUNDS: usize = 15;
+pub(super) const ROUNDS: usize = 15;
 
-/// Centres of patches.
+/// Centres of rows.
+#[derive(Debug, Clone)]
+pub struct Centres {
+    /// `[centres, width]`.
+    values: Vec<f32>,
+    width: usize,
+}
+
+impl Centres {
+    /// `count` centres of `rows`, `[rows, width]`; `None` without rows.
+    #[must_use]
+    pub fn fit(rows: &[f32], width: usize, count: usize, seed: u64) -> Option<Self> {
+        let total = rows.len() / width;
+        if total == 0 || count == 0 {
+            return None;
+        }
+        let mut start: Vec<usize> = (0..total).collect();
+        start.shuffle(&mut stream(seed, "kmeans.start", 0, 0));
+        let mut values = Vec::with_capacity(count * width);
+        for i in 0..count {
+            let row = start[i % total];
+            values.extend_from_slice(&rows[row * width..(row + 1) * width]);
+        }
+        for _ in 0..ROUNDS {
+            let ids = closest(rows, &values, width);
+            let mut sums = vec![0.0_f64; count * width];
+            let mut counts = vec![0_u64; count];
+            for (id, row) in ids.iter().zip(rows.chunks_exact(width)) {
+                counts[*id as usize] += 1;
+                let sum = &mut sums[*id as usize * width..][..width];
+                sum.iter_mut()
+                    .zip(row)
+                    .for_each(|(sum, value)| *sum += f64::from(*value));
+            }
+            for (centre, count) in counts.iter().enumerate().filter(|(_, count)| **count > 0) {
+                for i in centre * width..(centre + 1) * width {
+                    values[i] = (sums[i] / *count as f64) as f32;
+                }
+            }
+        }
+        Some(Self { values, width })
+    }
+
+    /// Every row replaced by its nearest centre.
+    #[must_use]
+    pub fn project(&self, rows: &[f32]) -> Vec<f32> {
+        closest(rows, &self.values, self.width)
+            .iter()
+            .flat_map(|id| &self.values[*id as usize * self.width..][..self.width])
+            .copied()
+            .collect()
+    }
+}
+
+/// Centres of patches of signals.
 #[derive(Debug, Clone)]
 pub struct KMeans {
     patches: Patches,
-    /// `[centres, width]`.
-    centres: Vec<f32>,
+    centres: Centres,
 }
 
 impl KMeans {
@@ -36,53 +89,18 @@ impl KMeans {
             }
             patches.cut(&signals[signal].values, &mut rows);
         }
-        let total = rows.len() / width;
-        if total == 0 || count == 0 {
-            return None;
-        }
-        let mut start: Vec<usize> = (0..total).collect();
-        start.shuffle(&mut stream(seed, "kmeans.start", 0, 0));
-        let mut centres = Vec::with_capacity(count * width);
-        for i in 0..count {
-            let row = start[i % total];
-            centres.extend_from_slice(&rows[row * width..(row + 1) * width]);
-        }
-        for _ in 0..ROUNDS {
-            let ids = closest(&rows, &centres, width);
-            let mut sums = vec![0.0_f64; count * width];
-            let mut counts = vec![0_u64; count];
-            for (id, row) in ids.iter().zip(rows.chunks_exact(width)) {
-                counts[*id as usize] += 1;
-                let sum = &mut sums[*id as usize * width..][..width];
-                sum.iter_mut()
-                    .zip(row)
-                    .for_each(|(sum, value)| *sum += f64::from(*value));
-            }
-            for (centre, count) in counts.iter().enumerate().filter(|(_, count)| **count > 0) {
-                for i in centre * width..(centre + 1) * width {
-                    centres[i] = (sums[i] / *count as f64) as f32;
-                }
-            }
-        }
         Some(Self {
             patches: patches.clone(),
-            centres,
+            centres: Centres::fit(&rows, width, count, seed)?,
         })
     }
 
     /// The signal with every patch replaced by its nearest centre.
     #[must_use]
     pub fn reconstruct(&self, signal: &Prepared) -> Vec<f32> {
-        let width = self.patches.width();
         let mut rows = Vec::new();
         self.patches.cut(&signal.values, &mut rows);
-        let ids = closest(&rows, &self.centres, width);
-        let found: Vec<f32> = ids
-            .iter()
-            .flat_map(|id| &self.centres[*id as usize * width..][..width])
-            .copied()
-            .collect();
-        self.patches.join(&found)
+        self.patches.join(&self.centres.project(&rows))
     }
 }
 

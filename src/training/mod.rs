@@ -18,6 +18,7 @@ pub mod source;
 pub mod tokenizer;
 pub mod trainer;
 pub mod validation;
+pub mod video_kmeans;
 pub mod video_tokenizer;
 
 pub use loader::{Feed, Loader};

@@ -3,6 +3,7 @@
 use super::TrainTokenizerSettings;
 use super::scores::Scores;
 use crate::experiment::TokenFacts;
+use crate::modality::Shape;
 use std::fmt::Write;
 
 /// Words for the metrics; others are shown by name.
@@ -19,6 +20,7 @@ pub(super) fn markdown(
     settings: &TrainTokenizerSettings,
     tokens: &TokenFacts,
     parameters: usize,
+    shape: &Shape,
     scores: &Scores,
 ) -> String {
     let mut page = format!(
@@ -66,5 +68,17 @@ pub(super) fn markdown(
             tokens.vocabulary,
         );
     }
+    page.push_str("\nThe picture: ");
+    page.push_str(match shape {
+        Shape::Video { .. } => {
+            "held-out clips from top to bottom, each as it is, as it comes back from its tokens"
+        }
+        _ => "a held-out clip, what comes back from its tokens",
+    });
+    page.push_str(if scores.kmeans.is_empty() {
+        ".\n"
+    } else {
+        ", and from k-means.\n"
+    });
     page
 }

@@ -2,6 +2,7 @@
 
 use super::super::clip_signals::{damaged, extract, format, modality, open_split};
 use super::super::tokenizer_entry::TokenizerEntry;
+use super::picture::{self, Example};
 use super::scores::{Baselines, Scores, score};
 use super::{TrainTokenizerSettings, compute, report, tokens};
 use crate::clip::Signal;
@@ -12,12 +13,13 @@ use crate::modality::declared::Normalize;
 use crate::modality::{ClipFormat, Modality, Shape};
 use crate::run::checkpoint;
 use crate::tokenizer::normaliser::Normaliser;
-use crate::tokenizer::trained::{Prepared, VqTokenizer, prepare};
+use crate::tokenizer::trained::{Prepared, VqTokenizer, batch, prepare};
 use crate::tokenizer::video::{Network, VideoSettings, VideoTokenizer};
 use crate::tokenizer::vq::{VqSettings, VqVae};
 use crate::tokenizer::{Tokenizer, TokenizerError};
 use crate::training::kmeans::KMeans;
 use crate::training::tokenizer::{Trainer, TrainingError, mirrored};
+use crate::training::video_kmeans::VideoKMeans;
 use crate::training::video_tokenizer::VideoTrainer;
 use serde_json::{Value, json};
 use std::path::Path;
@@ -27,6 +29,9 @@ const STATE: &str = "state.safetensors";
 
 /// Clips read at a time.
 const CHUNK: usize = 256;
+
+/// Clips that a new network is calibrated on.
+const CALIBRATE: usize = 64;
 
 /// Clips whose mean is the trivial prediction of a video.
 const MEAN_CLIPS: usize = 64;
@@ -62,7 +67,7 @@ pub(super) fn run(
         format,
         modality,
     };
-    let (scores, count) = match &settings.tokenizer.settings {
+    let (scores, examples, count) = match &settings.tokenizer.settings {
         TokenizerEntry::Vq(sizes) => train_vq(settings, sizes, &data, context)?,
         TokenizerEntry::Video(sizes) => train_video(settings, sizes, &data, context)?,
     };
@@ -72,8 +77,12 @@ pub(super) fn run(
     std::fs::write(&path, text).map_err(StageError::io(&path))?;
     let facts = tokens(&settings.tokenizer.settings, &data.modality.shape())
         .map_err(|reason| damaged(&reason))?;
-    let page = report::markdown(settings, &facts, count, &scores);
+    let page = report::markdown(settings, &facts, count, &data.modality.shape(), &scores);
     super::super::evaluate::write_text(context.output(), "report/tokenizer.md", &page)?;
+    if let Some((name, bytes)) = picture::draw(&data.modality.shape(), &examples) {
+        let path = context.output().join("report").join(name);
+        std::fs::write(&path, bytes).map_err(StageError::io(&path))?;
+    }
     Ok(json!({
         "modality": settings.modality,
         "tokenizer": settings.tokenizer.name,
@@ -89,11 +98,11 @@ fn train_vq(
     sizes: &VqSettings,
     data: &Data,
     context: &mut dyn StageContext,
-) -> Result<(Scores, usize), StageError> {
+) -> Result<(Scores, Vec<Example>, usize), StageError> {
     let modality = data.modality.as_ref();
     let shape = modality.shape();
     let compute = compute(settings)?;
-    let model = VqVae::new(&Initialise::new(&compute, context.seed()), sizes, &shape)
+    let mut model = VqVae::new(&Initialise::new(&compute, context.seed()), sizes, &shape)
         .map_err(StageError::other)?;
     let signals = read_signals(settings, data, context)?;
     let normaliser = normaliser(
@@ -112,6 +121,11 @@ fn train_vq(
         prepared.len(),
         settings.modality
     ));
+    if settings.calibrate && !prepared.is_empty() {
+        let first = &prepared[..prepared.len().min(CALIBRATE)];
+        let batches: Vec<_> = first.chunks(16).map(|part| batch(&model, part)).collect();
+        model.calibrate(&batches).map_err(StageError::other)?;
+    }
     let trainer = Trainer::new(model, &settings.training(), context.seed())
         .map_err(|error| failed(error, settings))?;
     let mut training = VqTraining {
@@ -148,8 +162,8 @@ fn train_vq(
         mean: normaliser.mean().repeat(samples),
         codebook: &project,
     };
-    let scores = hold_out(settings, data, &tokenizer, &baselines, context)?;
-    Ok((scores, count))
+    let (scores, examples) = hold_out(settings, data, &tokenizer, &baselines, context)?;
+    Ok((scores, examples, count))
 }
 
 fn train_video(
@@ -157,7 +171,7 @@ fn train_video(
     sizes: &VideoSettings,
     data: &Data,
     context: &mut dyn StageContext,
-) -> Result<(Scores, usize), StageError> {
+) -> Result<(Scores, Vec<Example>, usize), StageError> {
     let modality = data.modality.as_ref();
     let Shape::Video {
         frames,
@@ -171,7 +185,7 @@ fn train_video(
     let network = Network::new(&Initialise::new(&compute, context.seed()), sizes)
         .map_err(StageError::other)?;
     let count = network.count();
-    let model = VideoTokenizer::new(
+    let mut model = VideoTokenizer::new(
         &settings.modality,
         [frames, height, width],
         network,
@@ -185,6 +199,18 @@ fn train_video(
         "{count} parameters, {} training videos",
         having.len()
     ));
+    let read = |index: usize| -> Result<Option<Signal>, StageError> {
+        let at = having[index];
+        let found = extract(&data.train, modality, &[], at..at + 1)?;
+        Ok(found.into_iter().next().map(|found| found.signal))
+    };
+    if settings.calibrate && !having.is_empty() {
+        let mut first = Vec::new();
+        for index in 0..having.len().min(CALIBRATE) {
+            first.extend(read(index)?);
+        }
+        model.calibrate(&first).map_err(StageError::other)?;
+    }
     let trainer = VideoTrainer::new(model, &settings.training(), context.seed())
         .map_err(|error| failed(error, settings))?;
     let mut training = VideoTraining {
@@ -199,24 +225,32 @@ fn train_video(
         .map_err(StageError::other)?;
     let mut mean = vec![0.0_f64; frames * height * width * 3];
     let mut seen = 0.0;
-    for index in having.iter().take(MEAN_CLIPS) {
-        for found in extract(&data.train, modality, &[], *index..index + 1)? {
+    for index in 0..having.len().min(MEAN_CLIPS) {
+        if let Some(signal) = read(index)? {
             seen += 1.0;
-            let values = found.signal.values.iter();
             mean.iter_mut()
-                .zip(values)
-                .for_each(|(m, v)| *m += f64::from(*v));
+                .zip(signal.values.iter())
+                .for_each(|(mean, value)| *mean += f64::from(*value));
         }
     }
+    let kmeans = if settings.kmeans {
+        VideoKMeans::fit(&tokenizer, having.len(), context.seed(), read)?
+    } else {
+        None
+    };
+    let project = |signal: &Signal| {
+        let values: Vec<f32> = signal.values.iter().copied().collect();
+        kmeans.as_ref().map(|kmeans| kmeans.reconstruct(&values))
+    };
     let baselines = Baselines {
         mean: mean
             .iter()
             .map(|sum| (sum / f64::max(seen, 1.0)) as f32)
             .collect(),
-        codebook: &|_| None,
+        codebook: &project,
     };
-    let scores = hold_out(settings, data, &tokenizer, &baselines, context)?;
-    Ok((scores, count))
+    let (scores, examples) = hold_out(settings, data, &tokenizer, &baselines, context)?;
+    Ok((scores, examples, count))
 }
 
 /// All training signals of the modality; for hands also those of the other hand in a mirror.
@@ -272,9 +306,9 @@ fn hold_out(
     tokenizer: &dyn Tokenizer,
     baselines: &Baselines<'_>,
     context: &mut dyn StageContext,
-) -> Result<Scores, StageError> {
+) -> Result<(Scores, Vec<Example>), StageError> {
     let Some(set) = &data.validation else {
-        return Ok(Scores::default());
+        return Ok(Default::default());
     };
     let most = settings.validation_clips.min(set.len());
     score(

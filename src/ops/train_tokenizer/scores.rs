@@ -2,6 +2,7 @@
 
 use super::super::clip_signals::{Extracted, extract};
 use super::errors::Errors;
+use super::picture::{Example, VIDEOS};
 use crate::clip::Signal;
 use crate::clip::store::ClipSet;
 use crate::experiment::{StageContext, StageError};
@@ -71,7 +72,7 @@ impl Scores {
     }
 }
 
-/// Scores `tokenizer` on the first `most` clips of `set` that have the modality.
+/// Scores `tokenizer` on the first `most` clips of `set` that have the modality, and keeps some to look at.
 pub(super) fn score(
     set: &ClipSet,
     most: usize,
@@ -79,7 +80,7 @@ pub(super) fn score(
     tokenizer: &dyn Tokenizer,
     baselines: &Baselines<'_>,
     context: &mut dyn StageContext,
-) -> Result<Scores, StageError> {
+) -> Result<(Scores, Vec<Example>), StageError> {
     let beside: &[&str] = match modality.name() {
         "gaze" => &["camera"],
         _ => &[],
@@ -87,6 +88,7 @@ pub(super) fn score(
     let (mut own, mut mean, mut kmeans) = (Errors::default(), Errors::default(), Errors::default());
     let mut ids = Vec::new();
     let mut clips = 0;
+    let mut examples = Vec::new();
     for start in (0..most).step_by(CHUNK) {
         if context.interrupted() {
             return Err(StageError::Interrupted);
@@ -100,8 +102,17 @@ pub(super) fn score(
             let values: Vec<f32> = decoded.values.iter().copied().collect();
             own.compare(modality, clip, signal, &values);
             mean.compare(modality, clip, signal, &baselines.mean);
-            if let Some(values) = (baselines.codebook)(signal) {
-                kmeans.compare(modality, clip, signal, &values);
+            let codebook = (baselines.codebook)(signal);
+            if let Some(values) = &codebook {
+                kmeans.compare(modality, clip, signal, values);
+            }
+            if examples.len() < VIDEOS {
+                examples.push(Example {
+                    truth: signal.values.iter().copied().collect(),
+                    valid: signal.valid.as_ref().map(|v| v.iter().copied().collect()),
+                    found: values,
+                    kmeans: codebook,
+                });
             }
         }
         ids.extend(grids.into_iter().flat_map(|grid| grid.ids));
@@ -110,7 +121,7 @@ pub(super) fn score(
     }
     let tokens = ids.len() as u64;
     let used = (tokens > 0).then(|| usage(ids, tokenizer.vocabulary()));
-    Ok(Scores {
+    let scores = Scores {
         clips,
         reconstruction: own.means(),
         mean: mean.means(),
@@ -118,5 +129,6 @@ pub(super) fn score(
         tokens,
         usage: used.map(|used| used.used),
         perplexity: used.map(|used| used.perplexity),
-    })
+    };
+    Ok((scores, examples))
 }

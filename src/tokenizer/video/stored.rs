@@ -1,11 +1,13 @@
-//! A video tokenizer as one safetensors file: the network's weights, and what it works on as metadata.
+//! A video tokenizer as one safetensors file: the network's weights, the statistics of wavelet coefficients where it has some,
+//! and what it works on as metadata.
 
 use std::collections::BTreeMap;
 use std::path::Path;
 
 use super::{Network, VideoSettings, VideoTokenizer};
-use crate::engine::{Compute, Initialise, Parameters, Weights};
-use crate::tokenizer::trained::FILE;
+use crate::engine::{Compute, HostTensor, Initialise, Parameters, Values, Weights};
+use crate::tokenizer::normaliser::Normaliser;
+use crate::tokenizer::trained::{DEVIATION, FILE, MEAN};
 use crate::tokenizer::{Tokenizer, TokenizerError};
 
 /// What the file says it is.
@@ -16,6 +18,15 @@ impl VideoTokenizer {
     #[must_use]
     pub fn weights(&self) -> Weights {
         let mut weights = self.network().weights();
+        if let Some(statistics) = self.statistics() {
+            let parts = [
+                (MEAN, statistics.mean()),
+                (DEVIATION, statistics.deviation()),
+            ];
+            for (name, values) in parts {
+                weights.insert_f32(name, values.to_vec(), &[values.len()]);
+            }
+        }
         weights.metadata = Self::describe(self.modality(), self.clip(), self.settings());
         weights
     }
@@ -44,17 +55,14 @@ impl VideoTokenizer {
     ///
     /// # Errors
     /// When the file is of another format, or its tensors are not those of its settings.
-    pub fn from_weights(weights: Weights, compute: &Compute) -> Result<Self, TokenizerError> {
+    pub fn from_weights(mut weights: Weights, compute: &Compute) -> Result<Self, TokenizerError> {
+        let metadata = std::mem::take(&mut weights.metadata);
         let text = |key: &str| -> Result<&str, TokenizerError> {
-            weights
-                .metadata
-                .get(key)
-                .map(String::as_str)
-                .ok_or_else(|| {
-                    TokenizerError::Other(format!(
-                        "the file does not say its `{key}`: it is no tokenizer of reviv"
-                    ))
-                })
+            metadata.get(key).map(String::as_str).ok_or_else(|| {
+                TokenizerError::Other(format!(
+                    "the file does not say its `{key}`: it is no tokenizer of reviv"
+                ))
+            })
         };
         if text("format")? != FORMAT {
             return Err(TokenizerError::Other(format!(
@@ -70,11 +78,29 @@ impl VideoTokenizer {
             .map_err(|error| wrong("settings", error.to_string()))?;
         let clip: [usize; 3] = serde_json::from_str(text("clip")?)
             .map_err(|error| wrong("clip", error.to_string()))?;
+        let statistics = [MEAN, DEVIATION].map(|name| weights.tensors.remove(name));
         let mut network = Network::new(&Initialise::to_load(compute), &settings)?;
         network
             .load(&weights)
             .map_err(|error| wrong("weights", error.to_string()))?;
-        Self::new(&modality, clip, network, compute)
+        let mut tokenizer = Self::new(&modality, clip, network, compute)?;
+        match statistics {
+            [None, None] => {}
+            [Some(mean), Some(deviation)] => {
+                let values = |tensor: HostTensor| match tensor.values {
+                    Values::F32(values) => Ok(values),
+                    other => Err(wrong("statistics", format!("{} numbers", other.kind()))),
+                };
+                tokenizer.standardise(Normaliser::new(values(mean)?, values(deviation)?)?)?;
+            }
+            _ => {
+                return Err(wrong(
+                    "statistics",
+                    format!("`{MEAN}` or `{DEVIATION}` is missing"),
+                ));
+            }
+        }
+        Ok(tokenizer)
     }
 
     /// Writes `tokenizer.safetensors` into `directory`; equal tokenizers give equal bytes.
@@ -106,10 +132,7 @@ mod tests {
         };
         let compute = Compute::cpu();
         let network = Network::new(&Initialise::new(&compute, 2), &settings).unwrap();
-        let one = VideoTokenizer::new("rgb", [4, 16, 16], network, &compute).unwrap();
-        let folder = tempfile::tempdir().unwrap();
-        one.write(folder.path()).unwrap();
-        let other = crate::tokenizer::open(folder.path()).unwrap();
+        let mut one = VideoTokenizer::new("rgb", [4, 16, 16], network, &compute).unwrap();
         let values = ArrayD::from_shape_fn(IxDyn(&[4, 16, 16, 3]), |at| {
             ((at[0] * 7 + at[1] * 3 + at[2]) as f32 * 0.1).sin()
         });
@@ -117,10 +140,22 @@ mod tests {
             values,
             valid: None,
         };
-        assert_eq!(other.modality(), "rgb");
-        assert_eq!(
-            other.encode(std::slice::from_ref(&signal)).unwrap(),
-            one.encode(&[signal]).unwrap()
-        );
+        let folder = tempfile::tempdir().unwrap();
+        for calibrated in [false, true] {
+            if calibrated {
+                one.calibrate(std::slice::from_ref(&signal)).unwrap();
+            }
+            one.write(folder.path()).unwrap();
+            let other = crate::tokenizer::open(folder.path()).unwrap();
+            assert_eq!(other.modality(), "rgb");
+            let tokens = one.encode(std::slice::from_ref(&signal)).unwrap();
+            let again = other.encode(std::slice::from_ref(&signal)).unwrap();
+            assert_eq!(again, tokens);
+            assert_eq!(other.decode(&tokens).unwrap(), one.decode(&tokens).unwrap());
+        }
+        let mut torn = one.weights();
+        torn.tensors.remove(MEAN);
+        let error = VideoTokenizer::from_weights(torn, &compute).unwrap_err();
+        assert!(error.to_string().contains("statistics"), "{error}");
     }
 }

@@ -1,15 +1,16 @@
 //! Video signals to tokens and back, and the loss of one training step.
 
-use burn::tensor::{Tensor, TensorData};
+use burn::tensor::{Device, Tensor, TensorData};
 use ndarray::{ArrayD, IxDyn};
 
 use super::layers::Extent;
+use super::maps::{Map, maps};
 use super::padding::Padding;
 use super::settings::COLOURS;
 use super::{Fsq, Network, VideoSettings, haar};
 use crate::clip::Signal;
-use crate::engine::ops;
 use crate::engine::parameters::to_host;
+use crate::tokenizer::normaliser::Normaliser;
 use crate::tokenizer::{TokenGrid, Tokenizer, TokenizerError};
 
 /// A network with the modality and clip size it works on. Signals are `[frames, height, width, 3]` in [-1, 1].
@@ -20,8 +21,9 @@ pub struct VideoTokenizer {
     modality: String,
     padding: Padding,
     grid: Vec<usize>,
-    /// Pixels of a block to coefficients, and back.
-    haar: [Tensor<2>; 2],
+    /// Pixels of a block to the network's input, and its output to pixels.
+    maps: [Map; 2],
+    statistics: Option<Normaliser>,
 }
 
 /// What one training forward pass gives.
@@ -51,24 +53,14 @@ impl VideoTokenizer {
         }
         let settings = network.settings();
         let padding = Padding::of(clip, settings.temporal, settings.spatial);
-        let side = settings.coefficients();
-        let forward = haar::block_matrix(settings.patch, COLOURS);
-        let scale = settings.patch.pow(3) as f32;
-        let mut inverse = vec![0.0; forward.len()];
-        for row in 0..side {
-            for column in 0..side {
-                inverse[column * side + row] = forward[row * side + column] * scale;
-            }
-        }
-        let matrix = |values: Vec<f32>| {
-            Tensor::from_data(TensorData::new(values, [side, side]), compute.device())
-        };
+        let maps = maps(settings, None, compute.device());
         Ok(Self {
             fsq: Fsq::new(&settings.levels),
             modality: modality.to_owned(),
             grid: settings.grid(padding.padded).to_vec(),
             padding,
-            haar: [matrix(forward), matrix(inverse)],
+            maps,
+            statistics: None,
             network,
         })
     }
@@ -81,6 +73,34 @@ impl VideoTokenizer {
     /// For training and loading.
     pub fn network_mut(&mut self) -> &mut Network {
         &mut self.network
+    }
+
+    fn device(&self) -> Device {
+        self.maps[0].device()
+    }
+
+    /// Mean and deviation of each wavelet coefficient, where the network works on standardised ones.
+    #[must_use]
+    pub fn statistics(&self) -> Option<&Normaliser> {
+        self.statistics.as_ref()
+    }
+
+    /// Makes the network work on coefficients that are standardised by `statistics`.
+    ///
+    /// # Errors
+    /// When they are not those of as many coefficients as there are.
+    pub fn standardise(&mut self, statistics: Normaliser) -> Result<(), TokenizerError> {
+        let expected = self.settings().coefficients();
+        if statistics.width() != expected {
+            return Err(TokenizerError::Other(format!(
+                "{}: statistics of {} wavelet coefficients, the tokenizer has {expected}",
+                self.modality,
+                statistics.width()
+            )));
+        }
+        self.maps = maps(self.settings(), Some(&statistics), &self.device());
+        self.statistics = Some(statistics);
+        Ok(())
     }
 
     #[must_use]
@@ -121,7 +141,7 @@ impl VideoTokenizer {
     }
 
     /// Blocks of pixels of clips `[frames, height, width, 3]`: `[N, patch^3 * 3]`.
-    fn blocks(&self, clips: &[&[f32]]) -> Tensor<2> {
+    pub(super) fn blocks(&self, clips: &[&[f32]]) -> Tensor<2> {
         let mut values = Vec::new();
         for clip in clips {
             let padded = self.padding.pad(clip, COLOURS);
@@ -129,20 +149,25 @@ impl VideoTokenizer {
         }
         let side = self.settings().coefficients();
         let rows = values.len() / side;
-        let device = self.haar[0].device();
+        let device = self.device();
         Tensor::from_data(TensorData::new(values, [rows, side]), &device)
     }
 
+    /// The network's input of clips.
+    pub(super) fn coefficients(&self, clips: &[&[f32]]) -> Tensor<2> {
+        self.maps[0].apply(self.blocks(clips))
+    }
+
     /// Latents `[N', code width]` before quantisation.
-    fn latents(&self, blocks: Tensor<2>, samples: usize) -> Tensor<2> {
-        let coefficients = ops::linear(blocks, self.haar[0].clone(), None);
+    pub(super) fn latents(&self, blocks: Tensor<2>, samples: usize) -> Tensor<2> {
+        let coefficients = self.maps[0].apply(blocks);
         self.network.encode(coefficients, self.extent(samples)).0
     }
 
     /// Blocks of pixels `[N, patch^3 * 3]` of codes `[N', code width]`.
     fn pixels(&self, codes: Tensor<2>, samples: usize) -> Tensor<2> {
         let (coefficients, _) = self.network.decode(codes, self.token_extent(samples));
-        ops::linear(coefficients, self.haar[1].clone(), None)
+        self.maps[1].apply(coefficients)
     }
 
     /// The forward pass of one training step over clips `[frames, height, width, 3]`, gradients passing straight through the
@@ -159,7 +184,7 @@ impl VideoTokenizer {
         let host = to_host(bounded.clone());
         let tokens = self.fsq.index(&host);
         let width = self.fsq.width();
-        let device = self.haar[0].device();
+        let device = self.device();
         let codes = Tensor::from_data(
             TensorData::new(self.fsq.decode(&tokens), [tokens.len(), width]),
             &device,
@@ -182,7 +207,7 @@ impl VideoTokenizer {
             .map(|l| value(*l) as f32)
             .collect();
         let width = values.len();
-        Tensor::from_data(TensorData::new(values, [1, width]), &self.haar[0].device())
+        Tensor::from_data(TensorData::new(values, [1, width]), &self.device())
     }
 
     /// The squashed latents, differentiable.
@@ -190,10 +215,7 @@ impl VideoTokenizer {
         let squash: Vec<[f64; 3]> = (0..self.fsq.width()).map(|i| self.fsq.squash(i)).collect();
         let part = |k: usize| {
             let values: Vec<f32> = squash.iter().map(|s| s[k] as f32).collect();
-            Tensor::<2>::from_data(
-                TensorData::new(values, [1, squash.len()]),
-                &self.haar[0].device(),
-            )
+            Tensor::<2>::from_data(TensorData::new(values, [1, squash.len()]), &self.device())
         };
         (z + part(2)).tanh() * part(0) - part(1)
     }
@@ -210,12 +232,12 @@ impl VideoTokenizer {
         }
         Tensor::from_data(
             TensorData::new(values, [extent.rows(), side]),
-            &self.haar[0].device(),
+            &self.device(),
         )
     }
 
     /// The values of signals, row-major, checked for shape and finiteness.
-    fn checked(&self, signals: &[Signal]) -> Result<Vec<Vec<f32>>, TokenizerError> {
+    pub(super) fn checked(&self, signals: &[Signal]) -> Result<Vec<Vec<f32>>, TokenizerError> {
         let [frames, height, width] = self.padding.clip;
         let expected = vec![frames, height, width, COLOURS];
         let mut all = Vec::with_capacity(signals.len());
@@ -311,7 +333,7 @@ impl Tokenizer for VideoTokenizer {
                 });
             }
         }
-        let device = self.haar[0].device();
+        let device = self.device();
         tokens
             .iter()
             .map(|grid| {

@@ -1,0 +1,194 @@
+//! k-means on blocks of pixels, one per token: what a video tokenizer with as many tokens and codes has to be better than.
+
+use rand::seq::index;
+
+use super::kmeans::{Centres, PATCHES, ROUNDS};
+use crate::clip::Signal;
+use crate::random::stream;
+use crate::tokenizer::Tokenizer;
+use crate::tokenizer::video::VideoTokenizer;
+use crate::tokenizer::video::padding::Padding;
+
+/// Multiply-accumulates to spend on fitting; codebooks of tens of thousands have no such baseline.
+const WORK: usize = 200_000_000_000;
+
+/// Blocks per centre that a fit needs.
+const BLOCKS_PER_CENTRE: usize = 4;
+
+const COLOURS: usize = 3;
+
+/// How clips fall into blocks: one frame, then groups of frames, as the tokenizer sees them.
+#[derive(Debug, Clone)]
+struct Blocks {
+    padding: Padding,
+    spatial: usize,
+    temporal: usize,
+}
+
+impl Blocks {
+    /// Values of a block.
+    fn width(&self) -> usize {
+        self.temporal * self.spatial * self.spatial * COLOURS
+    }
+
+    /// Calls `visit(place in the blocks, place in the padded clip)` for every run of `spatial * COLOURS` values; the first
+    /// frame stands for a whole group.
+    fn runs(&self, mut visit: impl FnMut(usize, usize)) {
+        let [frames, height, width] = self.padding.padded;
+        let run = self.spatial * COLOURS;
+        let mut place = 0;
+        for group in 0..(frames - 1) / self.temporal + 1 {
+            for top in (0..height).step_by(self.spatial) {
+                for left in (0..width).step_by(self.spatial) {
+                    for frame in 0..self.temporal {
+                        let frame =
+                            (group * self.temporal + frame).saturating_sub(self.temporal - 1);
+                        for y in top..top + self.spatial {
+                            visit(place, ((frame * height + y) * width + left) * COLOURS);
+                            place += run;
+                        }
+                    }
+                }
+            }
+        }
+    }
+
+    /// `[blocks, width]`.
+    fn cut(&self, clip: &[f32]) -> Vec<f32> {
+        let padded = self.padding.pad(clip, COLOURS);
+        let run = self.spatial * COLOURS;
+        let mut rows = Vec::new();
+        self.runs(|_, at| rows.extend_from_slice(&padded[at..at + run]));
+        rows
+    }
+
+    fn paste(&self, rows: &[f32]) -> Vec<f32> {
+        let [frames, height, width] = self.padding.padded;
+        let run = self.spatial * COLOURS;
+        let mut padded = vec![0.0; frames * height * width * COLOURS];
+        self.runs(|place, at| padded[at..at + run].copy_from_slice(&rows[place..place + run]));
+        self.padding.crop(&padded, COLOURS)
+    }
+}
+
+/// Centres of blocks.
+#[derive(Debug, Clone)]
+pub struct VideoKMeans {
+    blocks: Blocks,
+    centres: Centres,
+}
+
+impl VideoKMeans {
+    /// As many centres as `tokenizer` has codes, of the blocks its tokens stand for. `read(i)` is clip `i` of `count`; clips
+    /// that it does not give are left out. `Ok(None)` without clips, or where the codebook is too large for the fit.
+    ///
+    /// # Errors
+    /// Those of `read`.
+    pub fn fit<E>(
+        tokenizer: &VideoTokenizer,
+        count: usize,
+        seed: u64,
+        mut read: impl FnMut(usize) -> Result<Option<Signal>, E>,
+    ) -> Result<Option<Self>, E> {
+        let settings = tokenizer.settings();
+        let blocks = Blocks {
+            padding: Padding::of(tokenizer.clip(), settings.temporal, settings.spatial),
+            spatial: settings.spatial,
+            temporal: settings.temporal,
+        };
+        let (width, codes) = (blocks.width(), tokenizer.vocabulary());
+        let most = (WORK / (width * codes * ROUNDS)).min(PATCHES);
+        if count == 0 || most < BLOCKS_PER_CENTRE * codes {
+            return Ok(None);
+        }
+        let each: usize = tokenizer.grid().iter().product();
+        // A few blocks of every clip, or all blocks of some.
+        let share = most.div_ceil(count).clamp(1, each);
+        let mut rows = Vec::new();
+        for clip in 0..count.min(most.div_ceil(share)) {
+            let Some(signal) = read(clip)? else {
+                continue;
+            };
+            let values: Vec<f32> = signal.values.iter().copied().collect();
+            let cut = blocks.cut(&values);
+            let mut random = stream(seed, "kmeans.blocks", clip as u64, 0);
+            for block in index::sample(&mut random, each, share) {
+                rows.extend_from_slice(&cut[block * width..(block + 1) * width]);
+            }
+        }
+        let centres = Centres::fit(&rows, width, codes, seed);
+        Ok(centres.map(|centres| Self { blocks, centres }))
+    }
+
+    /// The clip `[frames, height, width, 3]` with every block replaced by its nearest centre.
+    #[must_use]
+    pub fn reconstruct(&self, clip: &[f32]) -> Vec<f32> {
+        self.blocks
+            .paste(&self.centres.project(&self.blocks.cut(clip)))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::engine::{Compute, Initialise};
+    use crate::tokenizer::video::{Network, VideoSettings};
+    use ndarray::{ArrayD, IxDyn};
+    use std::convert::Infallible;
+
+    fn tokenizer(levels: &[usize]) -> VideoTokenizer {
+        let settings = VideoSettings {
+            channels: 4,
+            multipliers: vec![1, 2],
+            blocks: 1,
+            latent_channels: 4,
+            levels: levels.to_vec(),
+            ..VideoSettings::default()
+        };
+        let compute = Compute::cpu();
+        let network = Network::new(&Initialise::new(&compute, 2), &settings).unwrap();
+        VideoTokenizer::new("rgb", [5, 16, 24], network, &compute).unwrap()
+    }
+
+    fn clip(seed: usize) -> Signal {
+        let values = ArrayD::from_shape_fn(IxDyn(&[5, 16, 24, 3]), |at| {
+            ((at[0] * 31 + at[1] * 7 + at[2] * 3 + at[3] + seed) as f32).sin()
+        });
+        Signal {
+            values,
+            valid: None,
+        }
+    }
+
+    #[test]
+    fn blocks_come_back_where_they_were_cut() {
+        let tokenizer = tokenizer(&[3, 2]);
+        let blocks = Blocks {
+            padding: Padding::of(tokenizer.clip(), 4, 8),
+            spatial: 8,
+            temporal: 4,
+        };
+        let values: Vec<f32> = clip(0).values.iter().copied().collect();
+        let rows = blocks.cut(&values);
+        let tokens: usize = tokenizer.grid().iter().product();
+        assert_eq!(rows.len(), tokens * blocks.width());
+        assert_eq!(blocks.paste(&rows), values);
+    }
+
+    #[test]
+    fn as_many_centres_as_blocks_reconstruct_a_clip_and_huge_codebooks_have_no_baseline() {
+        let read = |i: usize| Ok::<_, Infallible>(Some(clip(i % 2)));
+        let near = |levels: &[usize]| {
+            let kmeans = VideoKMeans::fit(&tokenizer(levels), 12, 3, read).unwrap();
+            kmeans.map(|kmeans| {
+                let values: Vec<f32> = clip(1).values.iter().copied().collect();
+                let found = kmeans.reconstruct(&values);
+                let square = |(a, b): (&f32, &f32)| f64::from(a - b).powi(2);
+                found.iter().zip(&values).map(square).sum::<f64>() / values.len() as f64
+            })
+        };
+        let (few, many) = (near(&[2, 2]).unwrap(), near(&[4, 4, 3]).unwrap());
+        assert!(many < 0.5 * few, "{few} {many}");
+        assert!(near(&[64, 64, 16]).is_none());
+    }
+}
