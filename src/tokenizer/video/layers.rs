@@ -70,7 +70,8 @@ pub struct Conv {
 parameters!(Conv { weight => "conv3d.weight", bias => "conv3d.bias" });
 
 impl Conv {
-    /// Weight uniform in `+- sqrt(3 / fan in)`, so that activations keep their variance through dozens of convolutions; no bias.
+    /// Weight uniform in `+- sqrt(3 / fan in)`, so that activations keep their variance through dozens of convolutions; bias
+    /// uniform in `+- 1 / sqrt(fan in)`, so that the norms have something to divide by where a frame is black.
     #[must_use]
     pub fn new(place: &Initialise<'_>, inputs: usize, outputs: usize, kernel: Kernel) -> Self {
         let size = match kernel {
@@ -83,7 +84,7 @@ impl Conv {
         let shape = [outputs, inputs, size[0], size[1], size[2]];
         Self {
             weight: place.uniform("conv3d.weight", &shape, bound),
-            bias: place.constant(&[outputs], 0.0),
+            bias: place.uniform("conv3d.bias", &[outputs], (fan_in as f64).powf(-0.5)),
             kernel,
         }
     }
