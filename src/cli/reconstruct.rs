@@ -9,7 +9,7 @@ use crate::reconstruction::folder::{FOLDER, Manifest, PAGE};
 use crate::reconstruction::predictions::ScaleStatus;
 use crate::run::execute::{Job, Outcome, cache_of, execute};
 use crate::run::schedule::Schedule;
-use crate::run::{Interrupt, RunDirectory, RunError, Shard, State, files, metrics};
+use crate::run::{Crew, Interrupt, RunDirectory, RunError, Shard, State, files, metrics};
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
@@ -80,6 +80,7 @@ impl super::Run for Reconstruct {
             runs: &self.place.runs,
             only: None,
             shard: Shard::WHOLE,
+            crew: Crew::alone(),
             progress: &progress,
             interrupt: &interrupt,
         })

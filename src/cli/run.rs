@@ -5,7 +5,7 @@ use super::sweep_table;
 use super::terminal::{Failure, Terminal};
 use crate::experiment::catalog::Catalog;
 use crate::run::execute::{Job, Outcome, execute};
-use crate::run::{Interrupt, Progress, RunError, Shard, State};
+use crate::run::{Crew, Interrupt, Progress, RunError, Shard, State};
 use std::path::{Path, PathBuf};
 
 /// Run an experiment or a sweep; continue it where it was interrupted
@@ -22,6 +22,10 @@ pub struct Run {
     /// Do one of N parts of a sweep; run the others beside it, on any machine that shares the disk
     #[arg(long, value_name = "I/N", default_value_t = Shard::WHOLE)]
     shard: Shard,
+    /// Stages made at the same time [default: as many as there are cores, up to 4, as far as their planned memory fits into half
+    /// of the machine's]
+    #[arg(long, short, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
+    jobs: Option<u16>,
     #[command(flatten)]
     place: Place,
 }
@@ -45,6 +49,7 @@ impl super::Run for Run {
             runs: &self.place.runs,
             only: self.only.as_deref(),
             shard: self.shard,
+            crew: Crew::of_this_machine(self.jobs.map(usize::from)),
             progress: &progress,
             interrupt: &interrupt,
         };

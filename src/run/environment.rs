@@ -80,7 +80,8 @@ fn field_of(file: &str, name: &str) -> Option<String> {
     Some(line.split_once(':')?.1.trim().to_owned())
 }
 
-fn memory() -> Option<u64> {
+/// Bytes of memory of this machine, where it says so.
+pub fn memory() -> Option<u64> {
     let text = field_of("/proc/meminfo", "MemTotal")?;
     let kib: u64 = text.strip_suffix("kB")?.trim().parse().ok()?;
     kib.checked_mul(1024)

@@ -4,6 +4,7 @@
 //! under its key's lock, so that shards and other runs over the same disk wait for it instead of doing it twice.
 
 use super::cache::{Cache, Entry, Key};
+use super::crew::{Crew, Ended};
 use super::error::RunError;
 use super::inputs::Fingerprints;
 use super::interrupt::Interrupt;
@@ -15,6 +16,7 @@ use super::{provenance, report};
 use crate::experiment::Experiment;
 use std::collections::BTreeSet;
 use std::path::Path;
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 /// What to run, and how.
 pub struct Job<'a> {
@@ -24,6 +26,8 @@ pub struct Job<'a> {
     /// Only this stage, and what it needs.
     pub only: Option<&'a str>,
     pub shard: Shard,
+    /// How many stages at once.
+    pub crew: Crew,
     pub progress: &'a Progress,
     pub interrupt: &'a Interrupt,
 }
@@ -74,23 +78,26 @@ pub fn execute(job: &Job<'_>) -> Result<Outcome, RunError> {
 
     let owned = run.own(job.shard)?;
     owned.begin()?;
-    let mut worker = Worker {
+    let worker = Worker {
         job,
         schedule: &schedule,
         cache: &cache,
         run: &run,
-        made: 0,
-        failures: Vec::new(),
+        made: AtomicUsize::new(0),
     };
-    let ended = provenance::write(job, &schedule, &run).and_then(|()| worker.work(&targets));
-    let Worker {
-        made, mut failures, ..
-    } = worker;
-    let state = match ended {
-        Ok(()) if failures.is_empty() => State::Done,
-        Ok(()) => State::Failed,
-        Err(RunError::Interrupted) => State::Interrupted,
-        Err(error) => {
+    let Ended { mut failures, end } = match provenance::write(job, &schedule, &run) {
+        Ok(()) => worker.work(&targets),
+        Err(error) => Ended {
+            end: Some(error),
+            ..Ended::default()
+        },
+    };
+    let made = worker.made.into_inner();
+    let state = match end {
+        None if failures.is_empty() => State::Done,
+        None => State::Failed,
+        Some(RunError::Interrupted) => State::Interrupted,
+        Some(error) => {
             failures.push(error);
             State::Failed
         }
@@ -138,35 +145,31 @@ struct Worker<'a> {
     schedule: &'a Schedule,
     cache: &'a Cache,
     run: &'a RunDirectory,
-    made: usize,
-    failures: Vec<RunError>,
+    made: AtomicUsize,
 }
 
 impl Worker<'_> {
-    fn work(&mut self, targets: &BTreeSet<Key>) -> Result<(), RunError> {
+    /// Makes what `targets` need.
+    fn work(&self, targets: &BTreeSet<Key>) -> Ended {
         let to_do = self.schedule.to_do(targets, self.cache);
-        self.note_found()?;
-        let mut failed: BTreeSet<Key> = BTreeSet::new();
-        for (index, work) in to_do.iter().enumerate() {
-            if work.input_keys().any(|key| failed.contains(&key)) {
-                failed.insert(work.key);
-                continue;
-            }
+        if let Err(error) = self.note_found() {
+            return Ended {
+                end: Some(error),
+                ..Ended::default()
+            };
+        }
+        let make = |index: usize, work: &Work| {
             self.job.interrupt.check()?;
             let label = work.label(self.schedule.sweep);
-            match self.one(work, &label, index + 1, to_do.len()) {
-                Ok(()) => {}
-                Err(RunError::Interrupted) => return Err(RunError::Interrupted),
-                // Without space nothing else can go well.
-                Err(error @ RunError::NoSpace { .. }) => return Err(error),
-                Err(error) => {
-                    self.job.progress.say(&format!("  failed {label}: {error}"));
-                    failed.insert(work.key);
-                    self.failures.push(error);
-                }
+            let made = self.one(work, &label, index + 1, to_do.len());
+            if let Err(error) = &made
+                && !ends(error)
+            {
+                self.job.progress.say(&format!("  failed {label}: {error}"));
             }
-        }
-        Ok(())
+            made
+        };
+        self.job.crew.work(&to_do, make, ends)
     }
 
     /// Leaves a note in the directory of every stage that is in the cache already.
@@ -187,7 +190,7 @@ impl Worker<'_> {
         Ok(())
     }
 
-    fn one(&mut self, work: &Work, label: &str, index: usize, of: usize) -> Result<(), RunError> {
+    fn one(&self, work: &Work, label: &str, index: usize, of: usize) -> Result<(), RunError> {
         let progress = self.job.progress;
         let _lock = self.cache.lock(&work.key, self.job.interrupt, |holder| {
             let who =
@@ -215,11 +218,16 @@ impl Worker<'_> {
             "  [{index}/{of}] {label}: done in {}",
             duration(made.seconds)
         ));
-        self.made += 1;
+        self.made.fetch_add(1, Ordering::Relaxed);
         Ok(())
     }
 
     fn directory(&self, work: &Work) -> std::path::PathBuf {
         self.run.path().join("stages").join(&work.directory)
     }
+}
+
+/// Asked to stop, or without space: nothing else can go well.
+fn ends(error: &RunError) -> bool {
+    matches!(error, RunError::Interrupted | RunError::NoSpace { .. })
 }

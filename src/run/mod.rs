@@ -4,7 +4,7 @@
 //! * [`record`] the run directory and its state; [`cache`] where artifacts live; [`lock`] who may write; [`files`] how anything
 //!   is written; [`error`] what can go wrong
 //! * [`checkpoint`] what a stage keeps to go on from; [`metrics`] and [`tensorboard`] what a stage records; [`progress`] what a person sees meanwhile; [`interrupt`] Ctrl-C
-//! * [`schedule`] what there is to do; [`stage`] one piece of it, and `context` what its op sees; [`execute`] all of it
+//! * [`schedule`] what there is to do; [`stage`] one piece of it, and `context` what its op sees; [`crew`] several at once; [`execute`] all of it
 //! * [`inputs`] what lies outside; [`provenance`] where everything came from; [`report`] the run's page
 //! * [`verify`] whether it still holds; [`gc`] what can go
 //! * [`environment`] the only place that looks at machine, git and clock
@@ -12,6 +12,7 @@
 pub mod cache;
 pub mod checkpoint;
 mod context;
+pub mod crew;
 mod curves;
 pub mod environment;
 pub mod error;
@@ -33,6 +34,7 @@ pub mod tensorboard;
 pub mod verify;
 
 pub use cache::{Cache, Key, Manifest};
+pub use crew::Crew;
 pub use error::RunError;
 pub use interrupt::Interrupt;
 pub use progress::Progress;

@@ -9,7 +9,7 @@ use reviv::formats::npy::NpyArray;
 use reviv::formats::npz::Npz;
 use reviv::formats::png::{Picture, read};
 use reviv::run::execute::{Job, cache_of, execute};
-use reviv::run::{Interrupt, Progress, State};
+use reviv::run::{Crew, Interrupt, Progress, State};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 
@@ -66,6 +66,7 @@ fn run(folder: &Path, experiment: &str) -> Result<PathBuf, String> {
         runs: &runs,
         only: None,
         shard: "1/1".parse().unwrap(),
+        crew: Crew::alone(),
         progress: &Progress::silent(),
         interrupt: &Interrupt::default(),
     })

@@ -7,7 +7,9 @@ use reviv::experiment::{
 use reviv::run::execute::{Job, Outcome, cache_of, execute};
 use reviv::run::record::RunDirectory;
 use reviv::run::verify::{Check, Redo, Verdict};
-use reviv::run::{Cache, Interrupt, Progress, RunError, Shard, State, checkpoint, files, metrics};
+use reviv::run::{
+    Cache, Crew, Interrupt, Progress, RunError, Shard, State, checkpoint, files, metrics,
+};
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -232,11 +234,22 @@ fn run_as(
     only: Option<&str>,
     shard: &str,
 ) -> Result<Outcome, RunError> {
+    run_by(experiment, runs, only, shard, Crew::alone())
+}
+
+fn run_by(
+    experiment: &Experiment,
+    runs: &Path,
+    only: Option<&str>,
+    shard: &str,
+    crew: Crew,
+) -> Result<Outcome, RunError> {
     execute(&Job {
         experiment,
         runs,
         only,
         shard: shard.parse().unwrap(),
+        crew,
         progress: &Progress::silent(),
         interrupt: &Interrupt::default(),
     })
@@ -393,6 +406,26 @@ fn arms_and_seeds_share_what_they_agree_on() {
             .join("stages/shared/numbers/metrics.jsonl")
             .exists()
     );
+}
+
+#[test]
+fn stages_made_at_the_same_time_have_the_same_bytes() {
+    let cells = [0, 1, 2].map(|seed| cell("one", seed, json!({"steps": 12}), 1.0));
+    let asked = experiment(cells.into());
+    let dirs = [tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap()];
+    let outcomes = [1, 4].map(|jobs| {
+        let crew = Crew {
+            jobs,
+            ..Crew::alone()
+        };
+        let dir = dirs[usize::from(jobs > 1)].path();
+        run_by(&asked, dir, None, "1/1", crew).unwrap()
+    });
+    for outcome in &outcomes {
+        assert_eq!((outcome.state, outcome.made), (State::Done, 6));
+    }
+    let [one, several] = dirs.map(|dir| artifacts(&cache_of(dir.path())));
+    assert_eq!(one, several);
 }
 
 #[test]

@@ -3,7 +3,7 @@
 use reviv::experiment::catalog::Catalog;
 use reviv::experiment::load::{Request, load};
 use reviv::run::execute::{Job, Outcome, cache_of, execute};
-use reviv::run::{Interrupt, Progress, State};
+use reviv::run::{Crew, Interrupt, Progress, State};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 
@@ -33,6 +33,7 @@ fn run(folder: &Path, text: &str) -> Result<Outcome, String> {
         runs: &folder.join("runs"),
         only: None,
         shard: "1/1".parse().unwrap(),
+        crew: Crew::alone(),
         progress: &Progress::silent(),
         interrupt: &Interrupt::default(),
     })

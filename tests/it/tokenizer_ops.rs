@@ -4,7 +4,7 @@ use reviv::experiment::catalog::Catalog;
 use reviv::experiment::load::{Request, load};
 use reviv::mget::{MgetSpec, ModalitySpec, Positions, Size};
 use reviv::run::execute::{Job, cache_of, execute};
-use reviv::run::{Interrupt, Progress, State};
+use reviv::run::{Crew, Interrupt, Progress, State};
 use reviv::training::{Shards, TokenSource};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
@@ -66,6 +66,7 @@ fn run(folder: &Path) -> Vec<(String, PathBuf, Value)> {
         runs: &runs,
         only: None,
         shard: "1/1".parse().unwrap(),
+        crew: Crew::alone(),
         progress: &Progress::silent(),
         interrupt: &Interrupt::default(),
     })
