@@ -11,6 +11,7 @@ use crate::masking::PIXELS;
 use crate::mget::{Content, Mget, ModalitySpec};
 use crate::modality::{self, ClipFormat, Modality};
 use crate::tokenizer::{self, TokenGrid, Tokenizer, TokenizerError};
+use rand::RngExt;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -296,13 +297,13 @@ impl Reconstructor {
             })
             .collect();
         let targets: Vec<&str> = wish.wanted.iter().map(String::as_str).collect();
-        let generated = generate(
-            &MgetTokens::new(&self.model),
-            wish.decoding,
-            &samples,
-            &targets,
-            wish.seed,
-        )?;
+        let model = MgetTokens::new(&self.model);
+        let rounds = (0..wish.decoding.samples.max(1))
+            .map(|round| {
+                let seed = seed_of_round(wish.seed, round);
+                generate(&model, wish.decoding, &samples, &targets, seed)
+            })
+            .collect::<Result<Vec<_>, _>>()?;
         let mut made: Vec<Reconstructed> = clips
             .iter()
             .map(|clip| Reconstructed {
@@ -313,21 +314,26 @@ impl Reconstructor {
         for name in wish.wanted {
             let modality = self.modality(name)?;
             let tokenizer = &self.tokenizers[name];
-            let own: Vec<&GeneratedTokens> = generated
-                .iter()
-                .filter_map(|g| g.targets.get(name))
-                .collect();
-            let grids: Vec<TokenGrid> = own
-                .iter()
-                .map(|tokens| TokenGrid {
-                    ids: tokens.ids.clone(),
-                    grid: tokenizer.grid().to_vec(),
-                })
-                .collect();
-            let signals = tokenizer.decode(&grids)?;
-            for ((one, signal), tokens) in made.iter_mut().zip(signals).zip(own) {
+            let mut mean = Mean::default();
+            for generated in &rounds {
+                let own: Vec<&GeneratedTokens> = generated
+                    .iter()
+                    .filter_map(|g| g.targets.get(name))
+                    .collect();
+                let grids: Vec<TokenGrid> = own
+                    .iter()
+                    .map(|tokens| TokenGrid {
+                        ids: tokens.ids.clone(),
+                        grid: tokenizer.grid().to_vec(),
+                    })
+                    .collect();
+                let confidence = own.iter().map(|tokens| tokens.confidence.clone()).collect();
+                mean.add(tokenizer.decode(&grids)?, confidence);
+            }
+            let (signals, confidence) = mean.finish();
+            for ((one, signal), tokens) in made.iter_mut().zip(signals).zip(confidence) {
                 let steps = tokenizer.grid()[0];
-                let each = per_sample(&tokens.confidence, steps, signal.values.shape()[0]);
+                let each = per_sample(&tokens, steps, signal.values.shape()[0]);
                 one.confidence.insert(name.clone(), each);
                 modality
                     .insert(signal, &mut one.clip)
@@ -386,6 +392,51 @@ fn wrong_clip(clip: &Clip, reason: impl std::fmt::Display) -> ReconstructorError
     }
 }
 
+/// The first round has the seed itself.
+fn seed_of_round(seed: u64, round: usize) -> u64 {
+    match round {
+        0 => seed,
+        _ => crate::random::stream(seed, "decoding.round", round as u64, 0).random(),
+    }
+}
+
+/// The mean over rounds of every clip's signal and confidence.
+#[derive(Default)]
+struct Mean {
+    rounds: usize,
+    signals: Vec<Signal>,
+    confidence: Vec<Vec<f32>>,
+}
+
+impl Mean {
+    fn add(&mut self, signals: Vec<Signal>, confidence: Vec<Vec<f32>>) {
+        self.rounds += 1;
+        if self.rounds == 1 {
+            (self.signals, self.confidence) = (signals, confidence);
+            return;
+        }
+        for (sum, signal) in self.signals.iter_mut().zip(signals) {
+            sum.values += &signal.values;
+        }
+        for (sum, values) in self.confidence.iter_mut().zip(confidence) {
+            for (sum, value) in sum.iter_mut().zip(values) {
+                *sum += value;
+            }
+        }
+    }
+
+    fn finish(mut self) -> (Vec<Signal>, Vec<Vec<f32>>) {
+        let rounds = self.rounds.max(1) as f32;
+        for signal in &mut self.signals {
+            signal.values /= rounds;
+        }
+        for value in self.confidence.iter_mut().flatten() {
+            *value /= rounds;
+        }
+        (self.signals, self.confidence)
+    }
+}
+
 /// The mean confidence of the tokens of each of `steps` time steps, spread over `samples`.
 fn per_sample(tokens: &[f32], steps: usize, samples: usize) -> Vec<f32> {
     let each = (tokens.len() / steps.max(1)).max(1);
@@ -408,6 +459,22 @@ mod tests {
         let tokens = [1.0, 0.0, 0.5, 0.5];
         assert_eq!(per_sample(&tokens, 2, 6), [0.5, 0.5, 0.5, 0.5, 0.5, 0.5]);
         assert_eq!(per_sample(&[0.25, 0.75], 2, 4), [0.25, 0.25, 0.75, 0.75]);
+    }
+
+    #[test]
+    fn rounds_are_averaged_and_the_first_has_the_seed_itself() {
+        assert_eq!(seed_of_round(7, 0), 7);
+        assert_ne!(seed_of_round(7, 1), seed_of_round(7, 2));
+        let signal = |value: f32| Signal {
+            values: ndarray::ArrayD::from_elem(vec![2, 1], value),
+            valid: None,
+        };
+        let mut mean = Mean::default();
+        mean.add(vec![signal(1.0)], vec![vec![0.5]]);
+        mean.add(vec![signal(2.0)], vec![vec![1.0]]);
+        let (signals, confidence) = mean.finish();
+        assert_eq!(signals[0].values, signal(1.5).values);
+        assert_eq!(confidence, [[0.75]]);
     }
 
     #[test]

@@ -117,6 +117,10 @@ pub struct DecodingSettings {
     pub hide: Option<Vec<String>>,
     /// The pass without conditions does not see finished targets of its chain either.
     pub grow: bool,
+    /// How often every clip is generated; the answer is the mean of the decoded signals. One sample looks like a motion that
+    /// happens; the mean of several has the smaller squared error and lies between motions.
+    #[schemars(range(min = 1))]
+    pub samples: usize,
     /// For every target.
     pub all: TargetSettings,
     /// Changes by target.
@@ -130,6 +134,7 @@ impl Default for DecodingSettings {
             chains: Vec::new(),
             hide: None,
             grow: true,
+            samples: 1,
             all: TargetSettings::default(),
             targets: BTreeMap::new(),
         }
