@@ -407,5 +407,5 @@ pub fn read_tokens(path: &Path, grid: &[usize]) -> Result<Vec<u32>, SourceError>
             format!("tokens of shape {:?} instead of {grid:?}", tokens.shape),
         ));
     }
-    Ok(tokens.to::<u32>()?.into_iter().collect())
+    Ok(tokens.to::<u32>()?.into_raw_vec_and_offset().0)
 }

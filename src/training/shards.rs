@@ -192,11 +192,11 @@ impl TokenSource for Shards {
                 let clip = array.to::<u8>().map_err(|error| refuse(&error))?;
                 sample
                     .pixels
-                    .insert(name.clone(), clip.into_iter().collect());
+                    .insert(name.clone(), clip.into_raw_vec_and_offset().0);
                 continue;
             };
             let ids = array.to::<u32>().map_err(|error| refuse(&error))?;
-            let ids: Vec<u32> = ids.into_iter().collect();
+            let ids = ids.into_raw_vec_and_offset().0;
             if ids.iter().any(|id| *id as usize != *vocabulary) {
                 let grid = shape.clone();
                 sample.tokens.insert(name.clone(), TokenGrid { ids, grid });

@@ -13,6 +13,7 @@ use super::FormatError;
 use element::with_data;
 use header::Header;
 use ndarray::{ArrayD, IxDyn};
+use std::any::Any;
 use std::path::Path;
 use values::{c_order, decode};
 
@@ -118,11 +119,15 @@ impl NpyArray {
                 ),
             })
         };
-        let values: Result<Vec<T>, FormatError> = with_data!(&self.data, v => v
-            .iter()
-            .enumerate()
-            .map(|(i, &x)| convert(i, T::from_number(x.to_number())))
-            .collect());
+        let same = with_data!(&self.data, v => (v as &dyn Any).downcast_ref::<Vec<T>>());
+        let values: Result<Vec<T>, FormatError> = match same {
+            Some(values) => Ok(values.clone()),
+            None => with_data!(&self.data, v => v
+                .iter()
+                .enumerate()
+                .map(|(i, &x)| convert(i, T::from_number(x.to_number())))
+                .collect()),
+        };
         ArrayD::from_shape_vec(IxDyn(&self.shape), values?).map_err(|e| FormatError::Conversion {
             reason: e.to_string(),
         })
