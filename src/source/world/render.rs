@@ -54,7 +54,8 @@ struct Sample {
     part: Part,
 }
 
-const TILE: u32 = 8;
+/// Tiles across the image, as far as they are not below two pixels: rays of a tile share candidates.
+const TILES: u32 = 64;
 const SHADOW_TILES: u32 = 24;
 const GAMMA_STEPS: usize = 4096;
 
@@ -119,12 +120,13 @@ impl<'a> Renderer<'a> {
     ) -> Frame {
         let view = View::of_camera(T_world_camera, intrinsics);
         let primitives: Vec<Primitive> = moving.iter().map(|m| m.primitive).collect();
+        let tile = (view.width.max(view.height) / TILES).max(2);
         let pass = Pass {
             renderer: self,
             view,
             parts: moving.iter().map(|m| m.part).collect(),
-            fixed_bins: Bins::new(&view, TILE, &self.scene.primitives, |p| p.visible),
-            moving_bins: Bins::new(&view, TILE, &primitives, |p| p.visible),
+            fixed_bins: Bins::new(&view, tile, &self.scene.primitives, |p| p.visible),
+            moving_bins: Bins::new(&view, tile, &primitives, |p| p.visible),
             moving_shadows: Cube::new(self.scene.lamp, SHADOW_TILES, &primitives),
             moving: primitives,
             pixel: 1.0 / view.fx,
