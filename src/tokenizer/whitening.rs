@@ -89,7 +89,9 @@ impl Whitening {
 pub fn scale(weights: &mut Weights, by: f32, chosen: impl Fn(&str) -> bool) {
     for (name, tensor) in &mut weights.tensors {
         if let (true, Values::F32(values)) = (chosen(name), &mut tensor.values) {
-            values.iter_mut().for_each(|value| *value *= by);
+            for value in values {
+                *value *= by;
+            }
         }
     }
 }

@@ -37,7 +37,7 @@ impl Blocks {
         let [frames, height, width] = self.padding.padded;
         let run = self.spatial * COLOURS;
         let mut place = 0;
-        for group in 0..(frames - 1) / self.temporal + 1 {
+        for group in 0..=((frames - 1) / self.temporal) {
             for top in (0..height).step_by(self.spatial) {
                 for left in (0..width).step_by(self.spatial) {
                     for frame in 0..self.temporal {
