@@ -3,144 +3,25 @@
 //! `<split>/<modality>/<data set>/shard-000000.tar`, see [`crate::clip::store`]. A shard that is complete survives an
 //! interruption. Clip `i` of a split of the world is the same whatever the other numbers are.
 
-use crate::clip::depth_video::DepthCoding;
+mod settings;
+mod splits;
+
+pub use settings::{ClipsSettings, SourceSettings};
+
+use settings::MARKERS;
+use splits::{deliver, parts, refused};
+
 use crate::experiment::artifact::{ArtifactKind, Description, SignalFacts};
 use crate::experiment::context::{StageContext, StageError};
-use crate::experiment::entry::{Entry, Kind, KindEntry};
 use crate::experiment::problem::{Code, Problem};
 use crate::experiment::stage::{Inputs, Op, OpEntry, Port, StagePlan};
-use crate::modality::{self, ClipFormat, DeclaredSettings, Modality, Shape};
+use crate::modality::{self, Modality, Shape};
 use crate::source::convert::{ConvertSettings, convert};
-use crate::source::open::{Dataset, open};
-use crate::source::recording::CutSettings;
 use crate::source::shards::TarSink;
-use crate::source::split::{Chosen, SplitSettings, divide};
-use crate::source::world::clips::{SENSORS, WorldClips, sensor_of};
-use crate::source::world::{World, WorldSettings};
-use crate::source::{Source, SourceError};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
+use crate::source::world::clips::{SENSORS, sensor_of};
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::ops::ControlFlow;
-use std::path::Path;
-use std::sync::Arc;
-
-/// Where clips come from: a registry entry of kind `source`.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct SourceSettings {
-    /// The built-in synthetic world, where no `data` is named.
-    pub world: WorldSettings,
-    /// A data set of `data.yaml` instead of the world: recordings, videos, or clips that were converted before.
-    pub data: Option<String>,
-    /// What lies there; left out: what it looks like.
-    pub dataset: Option<Dataset>,
-    /// How clips are cut from recordings.
-    pub cut: CutSettings,
-    /// Which recordings are for training, which for validation and which for the test.
-    pub split: SplitSettings,
-    /// Leave out clips whose files are damaged instead of stopping at the first one.
-    pub skip_damaged: bool,
-}
-
-impl SourceSettings {
-    /// The sizes of the clips.
-    pub fn format(&self) -> ClipFormat {
-        match self.data {
-            Some(_) => self.cut.format(),
-            None => self.world.format(),
-        }
-    }
-}
-
-impl Kind for SourceSettings {
-    const KIND: &'static str = "source";
-    const ABOUT: &'static str = "Where clips come from: the built-in world, or recordings.";
-}
-
-impl Kind for DeclaredSettings {
-    const KIND: &'static str = "modality";
-    const ABOUT: &'static str = "Signals beyond the built-in ones, declared in YAML.";
-}
-
-inventory::submit! { KindEntry::of::<SourceSettings>() }
-inventory::submit! { KindEntry::of::<DeclaredSettings>() }
-
-/// Settings of `op: clips`.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
-pub struct ClipsSettings {
-    /// Where the clips come from.
-    pub source: Entry<SourceSettings>,
-    /// Clips to train on; from recordings at most so many.
-    #[serde(default)]
-    pub train: u64,
-    /// Clips to watch training with.
-    #[serde(default)]
-    pub validation: u64,
-    /// Clips that nothing was tuned on.
-    #[serde(default)]
-    pub test: u64,
-    /// How depth becomes video.
-    #[serde(default)]
-    pub depth: DepthCoding,
-    /// Modalities beyond the built-in ones, by registry name.
-    #[serde(default)]
-    pub declared: Vec<Entry<DeclaredSettings>>,
-}
-
-/// The first clip number of each split: far apart, so that the size of one split never changes another.
-const SPLITS: [(&str, u64); 3] = [
-    ("train", 0),
-    ("validation", 1_000_000_000),
-    ("test", 2_000_000_000),
-];
-
-/// Where the markers of finished shards are while a stage runs.
-const MARKERS: &str = ".finished";
-
-impl ClipsSettings {
-    fn count(&self, split: &str) -> u64 {
-        match split {
-            "train" => self.train,
-            "validation" => self.validation,
-            _ => self.test,
-        }
-    }
-
-    /// The splits that are not empty: name, first clip number, clips.
-    fn splits(&self) -> impl Iterator<Item = (&'static str, u64, u64)> + '_ {
-        SPLITS
-            .into_iter()
-            .map(|(name, first)| (name, first, self.count(name)))
-            .filter(|(_, _, count)| *count > 0)
-    }
-
-    /// The sizes of the clips.
-    pub fn format(&self) -> ClipFormat {
-        let declared = self.declared.iter().map(|entry| DeclaredSettings {
-            name: entry.name.clone(),
-            ..entry.settings.clone()
-        });
-        ClipFormat {
-            depth: self.depth,
-            declared: declared.collect(),
-            ..self.source.settings.format()
-        }
-    }
-
-    /// Bytes of one clip on disk.
-    fn clip_bytes(&self) -> u64 {
-        let format = self.source.settings.format();
-        (format.size * format.size * format.frames * 7) as u64 + 80_000
-    }
-
-    /// Shards of about 64 MB.
-    fn clips_per_shard(&self) -> u64 {
-        ((64 << 20) / self.clip_bytes()).clamp(8, 500)
-    }
-}
 
 /// The shape of a modality's values.
 pub fn shape_of(modality: &dyn Modality) -> Vec<usize> {
@@ -346,121 +227,13 @@ impl Op for Clips {
     }
 }
 
-/// A split and its clips.
-type Part = (&'static str, Arc<dyn Source>);
-
-/// The clips of each split, in the order they are stored.
-fn parts(
-    settings: &ClipsSettings,
-    format: &ClipFormat,
-    context: &dyn StageContext,
-) -> Result<Vec<Part>, StageError> {
-    let from = &settings.source.settings;
-    let Some(data) = &from.data else {
-        let world = World::new(from.world.clone(), context.seed());
-        let part = |(split, first, count): (&'static str, u64, u64)| {
-            let clips = WorldClips::new(world.clone(), first..first + count);
-            let source: Arc<dyn Source> = Arc::new(clips.with_declared(&format.declared));
-            (split, source)
-        };
-        return Ok(settings.splits().map(part).collect());
-    };
-    let root = context.data_root(data).ok_or_else(|| StageError::Input {
-        code: Code::E0601,
-        message: format!("data set `{data}` is not configured"),
-        help: "add it to `data.yaml`".to_owned(),
-    })?;
-    let source = open(root, from.dataset, &from.cut, &format.declared).map_err(refused)?;
-    if let Some(there) = source.format() {
-        let size = |format: &ClipFormat| (format.frames, format.size, format.video_rate.to_bits());
-        if size(&there) != size(format) {
-            return Err(StageError::Input {
-                code: Code::E0401,
-                message: format!(
-                    "`{data}` holds clips of {} frames of {} pixels at {} Hz",
-                    there.frames, there.size, there.video_rate
-                ),
-                help: "make `cut: {fps, side}` say the same, or convert the recordings again"
-                    .to_owned(),
-            });
-        }
-    }
-    let asked: Vec<(&'static str, u64)> = settings
-        .splits()
-        .map(|(split, _, count)| (split, count))
-        .collect();
-    let divided = divide(source.as_ref(), &from.split, &asked).map_err(refused)?;
-    let mut parts: Vec<Part> = Vec::new();
-    for (split, clips) in divided {
-        if clips.is_empty() {
-            return Err(StageError::Input {
-                code: Code::E0601,
-                message: format!(
-                    "no recording for `{split}`: {} recordings, {} clips in all",
-                    source.recordings().len(),
-                    source.len()
-                ),
-                help: format!(
-                    "name some in `split: {{{split}_recordings: [...]}}`, or ask for fewer splits"
-                ),
-            });
-        }
-        parts.push((split, Arc::new(Chosen::new(Arc::clone(&source), clips))));
-    }
-    Ok(parts)
-}
-
-/// What is wrong with recordings is for the user to mend, what is wrong with the disk is not.
-fn refused(error: SourceError) -> StageError {
-    match error {
-        SourceError::Io { path, cause } => StageError::Io {
-            path: path.display().to_string(),
-            error: cause,
-        },
-        error => StageError::Input {
-            code: Code::E0601,
-            message: error.to_string(),
-            help: "`reviv data inspect` shows what can be read".to_owned(),
-        },
-    }
-}
-
-/// Moves finished shards to where the artifact is written.
-fn deliver(from: &Path, to: &Path) -> Result<(), StageError> {
-    for entry in std::fs::read_dir(from).map_err(StageError::io(from))? {
-        let path = entry.map_err(StageError::io(from))?.path();
-        if path.file_name().is_some_and(|name| name == MARKERS) {
-            continue;
-        }
-        std::fs::create_dir_all(to).map_err(StageError::io(to))?;
-        let target = to.join(path.file_name().unwrap_or_default());
-        if std::fs::rename(&path, &target).is_err() {
-            copy(&path, &target)?;
-        }
-    }
-    // The shards are gone from here: their markers must not outlive them.
-    std::fs::remove_dir_all(from).map_err(StageError::io(from))
-}
-
-fn copy(from: &Path, to: &Path) -> Result<(), StageError> {
-    if from.is_dir() {
-        std::fs::create_dir_all(to).map_err(StageError::io(to))?;
-        for entry in std::fs::read_dir(from).map_err(StageError::io(from))? {
-            let path = entry.map_err(StageError::io(from))?.path();
-            copy(&path, &to.join(path.file_name().unwrap_or_default()))?;
-        }
-        return Ok(());
-    }
-    std::fs::copy(from, to)
-        .map(|_| ())
-        .map_err(StageError::io(from))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::clip::store::ClipSet;
     use crate::experiment::context::InputArtifact;
+    use crate::modality::ClipFormat;
+    use std::path::Path;
     use std::path::PathBuf;
 
     struct Context {

@@ -27,12 +27,7 @@ const FRAMEWORK_USES: &[&str] = &["experiment", "run", "formats", "random"];
 const MOST_LINES: usize = 500;
 
 /// Longer already, to be split. A number may only fall.
-const LONGER: &[(&str, usize)] = &[
-    ("src/evaluation/evaluate.rs", 504),
-    ("src/source/aria/vrs/mod.rs", 686),
-    ("src/source/neutral.rs", 753),
-    ("src/source/recording.rs", 671),
-];
+const LONGER: &[(&str, usize)] = &[("src/evaluation/evaluate.rs", 504)];
 
 struct File {
     /// Relative to the package, with `/`.

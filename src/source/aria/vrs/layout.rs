@@ -1,7 +1,7 @@
 //! Typed fields of VRS records. A stream describes the layout of its records in JSON; fields are found by name, never by a
 //! remembered offset, because offsets changed between versions of the recorder.
 
-use super::Cursor;
+use super::stored::Cursor;
 use serde::Deserialize;
 use std::collections::BTreeMap;
 

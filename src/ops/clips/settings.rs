@@ -1,0 +1,127 @@
+//! What an experiment says of its clips.
+
+use crate::clip::depth_video::DepthCoding;
+use crate::experiment::entry::{Entry, Kind, KindEntry};
+use crate::modality::{ClipFormat, DeclaredSettings};
+use crate::source::open::Dataset;
+use crate::source::recording::CutSettings;
+use crate::source::split::SplitSettings;
+use crate::source::world::WorldSettings;
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+/// Where clips come from: a registry entry of kind `source`.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct SourceSettings {
+    /// The built-in synthetic world, where no `data` is named.
+    pub world: WorldSettings,
+    /// A data set of `data.yaml` instead of the world: recordings, videos, or clips that were converted before.
+    pub data: Option<String>,
+    /// What lies there; left out: what it looks like.
+    pub dataset: Option<Dataset>,
+    /// How clips are cut from recordings.
+    pub cut: CutSettings,
+    /// Which recordings are for training, which for validation and which for the test.
+    pub split: SplitSettings,
+    /// Leave out clips whose files are damaged instead of stopping at the first one.
+    pub skip_damaged: bool,
+}
+
+impl SourceSettings {
+    /// The sizes of the clips.
+    pub fn format(&self) -> ClipFormat {
+        match self.data {
+            Some(_) => self.cut.format(),
+            None => self.world.format(),
+        }
+    }
+}
+
+impl Kind for SourceSettings {
+    const KIND: &'static str = "source";
+    const ABOUT: &'static str = "Where clips come from: the built-in world, or recordings.";
+}
+
+impl Kind for DeclaredSettings {
+    const KIND: &'static str = "modality";
+    const ABOUT: &'static str = "Signals beyond the built-in ones, declared in YAML.";
+}
+
+inventory::submit! { KindEntry::of::<SourceSettings>() }
+inventory::submit! { KindEntry::of::<DeclaredSettings>() }
+
+/// Settings of `op: clips`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
+#[serde(deny_unknown_fields)]
+pub struct ClipsSettings {
+    /// Where the clips come from.
+    pub source: Entry<SourceSettings>,
+    /// Clips to train on; from recordings at most so many.
+    #[serde(default)]
+    pub train: u64,
+    /// Clips to watch training with.
+    #[serde(default)]
+    pub validation: u64,
+    /// Clips that nothing was tuned on.
+    #[serde(default)]
+    pub test: u64,
+    /// How depth becomes video.
+    #[serde(default)]
+    pub depth: DepthCoding,
+    /// Modalities beyond the built-in ones, by registry name.
+    #[serde(default)]
+    pub declared: Vec<Entry<DeclaredSettings>>,
+}
+
+/// The first clip number of each split: far apart, so that the size of one split never changes another.
+pub(super) const SPLITS: [(&str, u64); 3] = [
+    ("train", 0),
+    ("validation", 1_000_000_000),
+    ("test", 2_000_000_000),
+];
+
+/// Where the markers of finished shards are while a stage runs.
+pub(super) const MARKERS: &str = ".finished";
+
+impl ClipsSettings {
+    pub(super) fn count(&self, split: &str) -> u64 {
+        match split {
+            "train" => self.train,
+            "validation" => self.validation,
+            _ => self.test,
+        }
+    }
+
+    /// The splits that are not empty: name, first clip number, clips.
+    pub(super) fn splits(&self) -> impl Iterator<Item = (&'static str, u64, u64)> + '_ {
+        SPLITS
+            .into_iter()
+            .map(|(name, first)| (name, first, self.count(name)))
+            .filter(|(_, _, count)| *count > 0)
+    }
+
+    /// The sizes of the clips.
+    pub fn format(&self) -> ClipFormat {
+        let declared = self.declared.iter().map(|entry| DeclaredSettings {
+            name: entry.name.clone(),
+            ..entry.settings.clone()
+        });
+        ClipFormat {
+            depth: self.depth,
+            declared: declared.collect(),
+            ..self.source.settings.format()
+        }
+    }
+
+    /// Bytes of one clip on disk.
+    pub(super) fn clip_bytes(&self) -> u64 {
+        let format = self.source.settings.format();
+        (format.size * format.size * format.frames * 7) as u64 + 80_000
+    }
+
+    /// Shards of about 64 MB.
+    pub(super) fn clips_per_shard(&self) -> u64 {
+        ((64 << 20) / self.clip_bytes()).clamp(8, 500)
+    }
+}

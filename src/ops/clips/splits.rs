@@ -1,0 +1,123 @@
+//! Which clips go into which split, and the move to where the artifact is.
+
+use super::settings::{ClipsSettings, MARKERS};
+use crate::experiment::context::{StageContext, StageError};
+use crate::experiment::problem::Code;
+use crate::modality::ClipFormat;
+use crate::source::open::open;
+use crate::source::split::{Chosen, divide};
+use crate::source::world::World;
+use crate::source::world::clips::WorldClips;
+use crate::source::{Source, SourceError};
+use std::path::Path;
+use std::sync::Arc;
+
+/// A split and its clips.
+pub(super) type Part = (&'static str, Arc<dyn Source>);
+
+/// The clips of each split, in the order they are stored.
+pub(super) fn parts(
+    settings: &ClipsSettings,
+    format: &ClipFormat,
+    context: &dyn StageContext,
+) -> Result<Vec<Part>, StageError> {
+    let from = &settings.source.settings;
+    let Some(data) = &from.data else {
+        let world = World::new(from.world.clone(), context.seed());
+        let part = |(split, first, count): (&'static str, u64, u64)| {
+            let clips = WorldClips::new(world.clone(), first..first + count);
+            let source: Arc<dyn Source> = Arc::new(clips.with_declared(&format.declared));
+            (split, source)
+        };
+        return Ok(settings.splits().map(part).collect());
+    };
+    let root = context.data_root(data).ok_or_else(|| StageError::Input {
+        code: Code::E0601,
+        message: format!("data set `{data}` is not configured"),
+        help: "add it to `data.yaml`".to_owned(),
+    })?;
+    let source = open(root, from.dataset, &from.cut, &format.declared).map_err(refused)?;
+    if let Some(there) = source.format() {
+        let size = |format: &ClipFormat| (format.frames, format.size, format.video_rate.to_bits());
+        if size(&there) != size(format) {
+            return Err(StageError::Input {
+                code: Code::E0401,
+                message: format!(
+                    "`{data}` holds clips of {} frames of {} pixels at {} Hz",
+                    there.frames, there.size, there.video_rate
+                ),
+                help: "make `cut: {fps, side}` say the same, or convert the recordings again"
+                    .to_owned(),
+            });
+        }
+    }
+    let asked: Vec<(&'static str, u64)> = settings
+        .splits()
+        .map(|(split, _, count)| (split, count))
+        .collect();
+    let divided = divide(source.as_ref(), &from.split, &asked).map_err(refused)?;
+    let mut parts: Vec<Part> = Vec::new();
+    for (split, clips) in divided {
+        if clips.is_empty() {
+            return Err(StageError::Input {
+                code: Code::E0601,
+                message: format!(
+                    "no recording for `{split}`: {} recordings, {} clips in all",
+                    source.recordings().len(),
+                    source.len()
+                ),
+                help: format!(
+                    "name some in `split: {{{split}_recordings: [...]}}`, or ask for fewer splits"
+                ),
+            });
+        }
+        parts.push((split, Arc::new(Chosen::new(Arc::clone(&source), clips))));
+    }
+    Ok(parts)
+}
+
+/// What is wrong with recordings is for the user to mend, what is wrong with the disk is not.
+pub(super) fn refused(error: SourceError) -> StageError {
+    match error {
+        SourceError::Io { path, cause } => StageError::Io {
+            path: path.display().to_string(),
+            error: cause,
+        },
+        error => StageError::Input {
+            code: Code::E0601,
+            message: error.to_string(),
+            help: "`reviv data inspect` shows what can be read".to_owned(),
+        },
+    }
+}
+
+/// Moves finished shards to where the artifact is written.
+pub(super) fn deliver(from: &Path, to: &Path) -> Result<(), StageError> {
+    for entry in std::fs::read_dir(from).map_err(StageError::io(from))? {
+        let path = entry.map_err(StageError::io(from))?.path();
+        if path.file_name().is_some_and(|name| name == MARKERS) {
+            continue;
+        }
+        std::fs::create_dir_all(to).map_err(StageError::io(to))?;
+        let target = to.join(path.file_name().unwrap_or_default());
+        if std::fs::rename(&path, &target).is_err() {
+            copy(&path, &target)?;
+        }
+    }
+    // The shards are gone from here: their markers must not outlive them.
+    std::fs::remove_dir_all(from).map_err(StageError::io(from))
+}
+
+pub(super) fn copy(from: &Path, to: &Path) -> Result<(), StageError> {
+    if from.is_dir() {
+        std::fs::create_dir_all(to).map_err(StageError::io(to))?;
+        for entry in std::fs::read_dir(from).map_err(StageError::io(from))? {
+            let path = entry.map_err(StageError::io(from))?.path();
+            copy(&path, &to.join(path.file_name().unwrap_or_default()))?;
+        }
+        return Ok(());
+    }
+    std::fs::copy(from, to)
+        .map(|_| ())
+        .map_err(StageError::io(from))
+}

@@ -1,0 +1,73 @@
+//! The lens of a recording.
+
+use super::manifest::LensEntry;
+use crate::geometry::camera::{Camera, Fisheye624, KannalaBrandt, Lens, Pinhole};
+use crate::source::SourceError;
+use crate::source::error::Place;
+use std::path::Path;
+
+pub(super) fn lens_of(path: &Path, entry: &LensEntry) -> Result<Camera, SourceError> {
+    let wrong =
+        || SourceError::malformed(path, Place::File, "`lens` has parameters that are no lens");
+    let (lens, [width, height]) = match entry {
+        LensEntry::Pinhole {
+            parameters: [fx, fy, cx, cy],
+            size,
+        } => (
+            Lens::Pinhole(Pinhole {
+                fx: *fx,
+                fy: *fy,
+                cx: *cx,
+                cy: *cy,
+            }),
+            *size,
+        ),
+        LensEntry::KannalaBrandt {
+            parameters: [fx, fy, cx, cy, radial @ ..],
+            size,
+        } => (
+            Lens::KannalaBrandt(KannalaBrandt {
+                fx: *fx,
+                fy: *fy,
+                cx: *cx,
+                cy: *cy,
+                radial: *radial,
+            }),
+            *size,
+        ),
+        LensEntry::Fisheye624 { parameters, size } => (
+            Lens::Fisheye624(Fisheye624::from_parameters(parameters).ok_or_else(wrong)?),
+            *size,
+        ),
+    };
+    let parameters_ok = match &lens {
+        Lens::Pinhole(Pinhole { fx, fy, .. })
+        | Lens::KannalaBrandt(KannalaBrandt { fx, fy, .. }) => *fx > 0.0 && *fy > 0.0,
+        Lens::Fisheye624(_) => true,
+    };
+    if !parameters_ok || width == 0 || height == 0 {
+        return Err(wrong());
+    }
+    Ok(Camera {
+        lens,
+        width,
+        height,
+        valid_radius: None,
+    })
+}
+
+/// A stand-in where only poses matter: its lens is a fisheye, so that no pinhole intrinsics come out of it.
+pub(super) fn unknown_lens(width: u32, height: u32) -> Camera {
+    Camera {
+        lens: Lens::KannalaBrandt(KannalaBrandt {
+            fx: 1.0,
+            fy: 1.0,
+            cx: 0.0,
+            cy: 0.0,
+            radial: [0.0; 4],
+        }),
+        width,
+        height,
+        valid_radius: None,
+    }
+}

@@ -1,0 +1,152 @@
+//! Camera, gaze and joints of a clip, sampled on its clock.
+
+use super::pictures::pinhole;
+use super::{CutSettings, GAZE_RANGE, GazeSample, Recording};
+use crate::clip::clock::SIGNAL_RATE;
+use crate::clip::frames::WorldJoints;
+use crate::clip::{CameraTrack, GazeTrack, Intrinsics};
+use crate::geometry::camera::Lens;
+use crate::source::image::{SquareFit, Turn};
+use crate::source::track::{Joints, Track};
+use nalgebra::{Isometry3, Point3};
+use ndarray::{Array1, Array2};
+
+impl Recording {
+    /// Where the wearer looks at `time`: in units of the square picture, unbounded. `None` where it is not known or the point is
+    /// behind the camera.
+    #[must_use]
+    pub fn gaze_at(&self, time: i64, settings: &CutSettings) -> Option<[f64; 2]> {
+        let sample = self.gaze.as_ref()?.at(time)?;
+        let (u, v, width, height) = match sample {
+            GazeSample::Pixel {
+                pixel: [u, v],
+                size: [width, height],
+            } => (u, v, width, height),
+            GazeSample::Aria(gaze, pupils) => {
+                let mounted = self.mounted(time)?;
+                let distance = if settings.gaze_vergence && gaze.depth > 0.0 {
+                    gaze.depth
+                } else {
+                    settings.gaze_distance
+                };
+                let point = mounted.T_device_camera.inverse() * gaze.point(&pupils, distance);
+                let camera = match settings.undistort {
+                    Some(angle) => pinhole(
+                        &mounted.camera,
+                        angle,
+                        mounted.camera.width.min(mounted.camera.height),
+                    ),
+                    None => mounted.camera.clone(),
+                };
+                let pixel = camera.project(&point.coords)?;
+                let (w, h) = (f64::from(camera.width), f64::from(camera.height));
+                let (u, v) = self.turn.pixel(pixel.x, pixel.y, w, h);
+                let (width, height) = self.turn.size(camera.width, camera.height);
+                (u, v, f64::from(width), f64::from(height))
+            }
+        };
+        let side = width.min(height);
+        Some([
+            (u - (width - side) / 2.0) / side,
+            (v - (height - side) / 2.0) / side,
+        ])
+    }
+
+    pub(super) fn camera_track(
+        &self,
+        ticks: &[i64],
+        settings: &CutSettings,
+    ) -> Option<CameraTrack> {
+        self.device.as_ref()?;
+        let poses: Vec<Option<Isometry3<f64>>> =
+            ticks.iter().map(|tick| self.pose(*tick)).collect();
+        let valid = poses.iter().map(Option::is_some).collect();
+        // A missing pose repeats the last known one: readers that ignore validity get no jump to the origin.
+        let mut last = poses
+            .iter()
+            .flatten()
+            .next()
+            .copied()
+            .unwrap_or_else(Isometry3::identity);
+        let T_world_camera = poses
+            .into_iter()
+            .map(|pose| {
+                last = pose.unwrap_or(last);
+                last
+            })
+            .collect();
+        Some(CameraTrack {
+            rate: SIGNAL_RATE,
+            T_world_camera,
+            valid,
+            up_world: self.up_world,
+            intrinsics: self.intrinsics(ticks[0], settings),
+        })
+    }
+
+    /// Pinhole intrinsics of the clip's frames, where the frames are pinhole pictures.
+    pub(super) fn intrinsics(&self, time: i64, settings: &CutSettings) -> Option<Intrinsics> {
+        let camera = &self.mounted(time)?.camera;
+        let camera = match (settings.undistort, &camera.lens) {
+            (Some(angle), _) => pinhole(camera, angle, settings.side),
+            (None, Lens::Pinhole(_)) => {
+                let fit = SquareFit::new(camera.width, camera.height, settings.side);
+                let scale = f64::from(settings.side) / f64::from(camera.width.min(camera.height));
+                camera.resized(scale).cropped(
+                    f64::from(fit.left),
+                    f64::from(fit.top),
+                    fit.side,
+                    fit.side,
+                )
+            }
+            _ => return None,
+        };
+        let Lens::Pinhole(lens) = camera.lens else {
+            return None;
+        };
+        let size = f64::from(settings.side);
+        let (cx, cy) = self.turn.pixel(lens.cx, lens.cy, size, size);
+        let (fx, fy) = match self.turn {
+            Turn::None | Turn::Half => (lens.fx, lens.fy),
+            Turn::Clockwise | Turn::CounterClockwise => (lens.fy, lens.fx),
+        };
+        Some(Intrinsics {
+            fx,
+            fy,
+            cx,
+            cy,
+            width: settings.side,
+            height: settings.side,
+        })
+    }
+
+    pub(super) fn gaze_track(&self, ticks: &[i64], settings: &CutSettings) -> GazeTrack {
+        let mut points = Array2::zeros((ticks.len(), 2));
+        let mut valid = Array1::from_elem(ticks.len(), false);
+        for (k, tick) in ticks.iter().enumerate() {
+            if let Some([u, v]) = self.gaze_at(*tick, settings)
+                && GAZE_RANGE.contains(&u)
+                && GAZE_RANGE.contains(&v)
+            {
+                points[[k, 0]] = u as f32;
+                points[[k, 1]] = v as f32;
+                valid[k] = true;
+            }
+        }
+        GazeTrack {
+            rate: SIGNAL_RATE,
+            points,
+            valid,
+        }
+    }
+}
+
+pub(super) fn world_joints(track: &Track<Joints>, ticks: &[i64]) -> WorldJoints {
+    ticks
+        .iter()
+        .map(|tick| match track.at(*tick) {
+            Some(joints) => joints.to_vec(),
+            None => vec![None::<Point3<f64>>; 21],
+        })
+        .collect()
+}
