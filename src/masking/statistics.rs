@@ -250,7 +250,8 @@ mod tests {
                 );
             }
         }
-        assert_eq!(found.input_tokens, 100.0);
+        // Each draw spends the whole budget; the means of three modalities round.
+        assert!((found.input_tokens - 100.0).abs() < 1e-9, "{found:?}");
     }
 
     #[test]
