@@ -94,7 +94,8 @@ fn main() {
         writer.finish().unwrap();
         Predictions::open(&path).unwrap()
     };
-    let folders = Folders::new(write("truth", &truth), write("prediction", &prediction));
+    let folders =
+        Folders::new(write("truth", &truth), write("prediction", &prediction)).expect("no floor");
     let ids = truth.iter().map(|c| c.id.clone()).collect();
     time(
         "in memory",

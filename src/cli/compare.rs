@@ -2,10 +2,14 @@
 
 use super::terminal::{Failure, Terminal};
 use crate::evaluation::compare::{CompareSettings, Entrant, compare};
+use crate::evaluation::intervals;
+use crate::evaluation::published::Published;
 use crate::evaluation::render::{Format, render};
 use crate::evaluation::scores::{FILE, Scores};
 use crate::evaluation::trajectory::TrajectoryErrors;
 use crate::evaluation::tum::{self, TimedPoses};
+use crate::experiment::catalog::Catalog;
+use crate::experiment::load;
 use crate::geometry::alignment::Freedom;
 use crate::run::RunDirectory;
 use crate::run::execute::cache_of;
@@ -32,6 +36,12 @@ pub struct Compare {
     /// Confidence level of the intervals
     #[arg(long, default_value_t = 0.95, value_name = "SHARE")]
     level: f64,
+    /// Published rows below the table, as context; `reviv list published` shows the names
+    #[arg(long, value_name = "NAME")]
+    against: Option<String>,
+    /// Also draw every row with its interval, into this file
+    #[arg(long, value_name = "FILE.svg")]
+    plot: Option<PathBuf>,
     /// How to write the table
     #[arg(long, default_value = "term", value_parser = ["term", "md", "latex", "csv"])]
     format: String,
@@ -70,9 +80,16 @@ impl super::Run for Compare {
             ..CompareSettings::default()
         };
         settings.interval.level = self.level;
-        let table = compare("", &entrants, &settings, None).map_err(|error| {
+        let published = self.against.as_deref().map(published).transpose()?;
+        let table = compare("", &entrants, &settings, published.as_ref()).map_err(|error| {
             Failure::input(error.to_string(), "`reviv list runs` shows all runs")
         })?;
+        if let Some(path) = &self.plot {
+            let plot = intervals::svg(&table)
+                .ok_or_else(|| Failure::input("no number to draw", "see the table"))?;
+            std::fs::write(path, plot)
+                .map_err(|error| Failure::machine(format_args!("`{}`: {error}", path.display())))?;
+        }
         if self.json {
             terminal.json(&table);
         } else {
@@ -81,6 +98,19 @@ impl super::Run for Compare {
         }
         Ok(())
     }
+}
+
+/// Published rows by the name of their entry.
+fn published(name: &str) -> Result<Published, Failure> {
+    let catalog = Catalog::linked();
+    load::entry(&catalog, Path::new("./x"), "published", name)
+        .and_then(|value| serde_json::from_value(value).ok())
+        .ok_or_else(|| {
+            Failure::input(
+                format!("no published rows `{name}`"),
+                "`reviv list published` shows all",
+            )
+        })
 }
 
 impl Compare {

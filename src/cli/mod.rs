@@ -10,6 +10,7 @@ mod data;
 mod gc;
 mod import;
 mod list;
+mod new;
 mod plan;
 mod reconstruct;
 mod request;
@@ -68,6 +69,7 @@ commands! {
     gc::Gc,
     import::Import,
     data::Data,
+    new::New,
     schema::Schema,
     completions::Completions,
 }

@@ -1,8 +1,9 @@
-//! The `compare:` block of a sweep: `report/table.{md,tex,csv}` of its run, which the run's page shows.
+//! The `compare:` block of a sweep: `report/table.{md,tex,csv}` and `report/table_intervals.svg` of its run, which the run's page shows.
 
 use super::compare::entrants_of;
 use super::terminal::Failure;
 use crate::evaluation::compare::{CompareSettings, IntervalSettings, compare};
+use crate::evaluation::intervals;
 use crate::evaluation::published::Published;
 use crate::evaluation::render::{Format, render};
 use crate::evaluation::statistics::Over;
@@ -31,7 +32,6 @@ pub fn write(
     let settings = CompareSettings {
         columns: asked.columns.clone(),
         baseline: asked.baseline.clone(),
-        against: asked.against.clone(),
         interval: IntervalSettings {
             level: asked.interval.level,
             over: over.collect(),
@@ -49,6 +49,9 @@ pub fn write(
     ] {
         files::write(&folder.join(name), render(&table, format).as_bytes())
             .map_err(Failure::machine)?;
+    }
+    if let Some(plot) = intervals::svg(&table) {
+        files::write(&folder.join(report::PLOT), plot.as_bytes()).map_err(Failure::machine)?;
     }
     report::write(run).map_err(Failure::machine)?;
     Ok(render(&table, Format::Terminal))

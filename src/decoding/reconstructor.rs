@@ -4,7 +4,9 @@
 //! (`tokenizers/<modality>/`), and [`FILE`], which says what clips it takes and names the tokenizers by their bytes, so that a
 //! model and tokenizers that do not belong together are found before anything is decoded into nonsense.
 
-use super::{DecodingError, DecodingSettings, GeneratedTokens, MgetTokens, Sample, Slot, generate};
+use super::{
+    DecodingError, DecodingSettings, Generated, GeneratedTokens, MgetTokens, Sample, Slot, generate,
+};
 use crate::clip::{Clip, Signal};
 use crate::engine::Compute;
 use crate::masking::PIXELS;
@@ -177,7 +179,7 @@ pub struct Wish<'a> {
 
 /// What the model sees of a batch of clips.
 #[derive(Default)]
-struct Seen<'a> {
+pub struct Seen<'a> {
     tokens: BTreeMap<&'a str, Vec<TokenGrid>>,
     pixels: Vec<Vec<f32>>,
 }
@@ -288,12 +290,26 @@ impl Reconstructor {
         wish: &Wish<'_>,
     ) -> Result<Vec<Reconstructed>, ReconstructorError> {
         let seen = self.see(clips, wish.given)?;
+        let generated = self.generate(&seen, ids, wish)?;
+        self.decode(clips, &generated, wish.wanted)
+    }
+
+    /// Generates the tokens of what is wanted, once per sample that is averaged; the middle of [`Reconstructor::reconstruct`].
+    ///
+    /// # Errors
+    /// When a modality is unknown.
+    pub fn generate(
+        &self,
+        seen: &Seen<'_>,
+        ids: &[u64],
+        wish: &Wish<'_>,
+    ) -> Result<Vec<Vec<Generated>>, ReconstructorError> {
         let samples: Vec<Sample<'_>> = ids
             .iter()
             .enumerate()
             .map(|(clip, &id)| Sample {
                 id,
-                slots: self.slots(&seen, clip),
+                slots: self.slots(seen, clip),
             })
             .collect();
         let targets: Vec<&str> = wish.wanted.iter().map(String::as_str).collect();
@@ -304,6 +320,19 @@ impl Reconstructor {
                 generate(&model, wish.decoding, &samples, &targets, seed)
             })
             .collect::<Result<Vec<_>, _>>()?;
+        Ok(rounds)
+    }
+
+    /// Turns generated tokens of `clips` into signals; the end of [`Reconstructor::reconstruct`].
+    ///
+    /// # Errors
+    /// When tokens and tokenizer do not fit.
+    pub fn decode(
+        &self,
+        clips: &[Clip],
+        rounds: &[Vec<Generated>],
+        wanted: &[String],
+    ) -> Result<Vec<Reconstructed>, ReconstructorError> {
         let mut made: Vec<Reconstructed> = clips
             .iter()
             .map(|clip| Reconstructed {
@@ -311,11 +340,11 @@ impl Reconstructor {
                 confidence: BTreeMap::new(),
             })
             .collect();
-        for name in wish.wanted {
+        for name in wanted {
             let modality = self.modality(name)?;
             let tokenizer = &self.tokenizers[name];
             let mut mean = Mean::default();
-            for generated in &rounds {
+            for generated in rounds {
                 let own: Vec<&GeneratedTokens> = generated
                     .iter()
                     .filter_map(|g| g.targets.get(name))
@@ -343,7 +372,47 @@ impl Reconstructor {
         Ok(made)
     }
 
-    fn see<'a>(&self, clips: &[Clip], given: &'a [String]) -> Result<Seen<'a>, ReconstructorError> {
+    /// The clips' own signals of `names` after a round trip through the tokenizers, where they have them: no model of these tokens
+    /// can do better.
+    ///
+    /// # Errors
+    /// When a modality is unknown, or a signal has another form than the model was trained on.
+    pub fn round_trip(
+        &self,
+        clips: &[Clip],
+        names: &[String],
+    ) -> Result<Vec<Clip>, ReconstructorError> {
+        let empty = |clip: &Clip| Clip::empty(clip.id.clone(), clip.source.clone());
+        let mut made: Vec<Clip> = clips.iter().map(empty).collect();
+        for name in names {
+            let (modality, tokenizer) = (self.modality(name)?, &self.tokenizers[name]);
+            let (mut places, mut signals) = (Vec::new(), Vec::new());
+            for (place, clip) in clips.iter().enumerate() {
+                let signal = modality.extract(clip);
+                if let Some(signal) = signal.map_err(|error| wrong_clip(clip, error))? {
+                    places.push(place);
+                    signals.push(signal);
+                }
+            }
+            let decoded = tokenizer.decode(&tokenizer.encode(&signals)?)?;
+            for (place, signal) in places.into_iter().zip(decoded) {
+                modality
+                    .insert(signal, &mut made[place])
+                    .map_err(|error| wrong_clip(&clips[place], error))?;
+            }
+        }
+        Ok(made)
+    }
+
+    /// Encodes what is given; the beginning of [`Reconstructor::reconstruct`].
+    ///
+    /// # Errors
+    /// When a modality is unknown, or a clip lacks a given one.
+    pub fn see<'a>(
+        &self,
+        clips: &[Clip],
+        given: &'a [String],
+    ) -> Result<Seen<'a>, ReconstructorError> {
         let mut seen = Seen::default();
         for name in given {
             let signals = self.signals(name, clips)?;

@@ -240,7 +240,7 @@ pub const PER_SET: &[Entry] = &[
 ];
 
 impl Column {
-    /// The column called `name`. A declared modality has the column `<modality>.rmse`.
+    /// The column called `name`. A declared modality has the columns `<modality>.<metric>` of [`DECLARED`].
     #[must_use]
     pub fn named(name: &str) -> Option<Self> {
         let entry = PER_CLIP.iter().chain(PER_SET).find(|entry| entry.0 == name);
@@ -277,6 +277,9 @@ impl Column {
     }
 }
 
+/// Metrics of modalities declared in YAML: root mean square error over the valid values, in their own units.
+pub const DECLARED: [&str; 1] = ["rmse"];
+
 /// The modality of a column `<modality>.rmse` that is none of the built-in ones.
 pub(crate) fn declared(name: &str) -> Option<&str> {
     let built_in = [
@@ -289,8 +292,9 @@ pub(crate) fn declared(name: &str) -> Option<&str> {
         "hands",
         "body",
     ];
-    let modality = name.strip_suffix(".rmse")?;
-    (!modality.is_empty() && !built_in.contains(&modality)).then_some(modality)
+    let (modality, metric) = name.split_once('.')?;
+    (DECLARED.contains(&metric) && !modality.is_empty() && !built_in.contains(&modality))
+        .then_some(modality)
 }
 
 /// Every column name, for messages and lists.

@@ -3,7 +3,7 @@
 use super::columns::Column;
 use super::outcome::{Outcome, mean};
 use super::published::Published;
-use super::scores::{ScoreSet, Scores};
+use super::scores::{FLOOR, ScoreSet, Scores};
 use super::statistics::{
     Difference, Interval, Over, RESAMPLES, Summary, bootstrap_mean, holm, paired_difference,
     student_interval, summarise,
@@ -27,8 +27,6 @@ pub struct CompareSettings {
     pub columns: Vec<String>,
     /// The entrant that all others are tested against.
     pub baseline: Option<String>,
-    /// Published rows beside the table, a registry entry of kind `published`.
-    pub against: Option<String>,
     pub interval: IntervalSettings,
     /// Show the trivial baselines.
     pub trivial_baselines: bool,
@@ -55,7 +53,6 @@ impl Default for CompareSettings {
         Self {
             columns: Vec::new(),
             baseline: None,
-            against: None,
             interval: IntervalSettings::default(),
             trivial_baselines: true,
         }
@@ -137,8 +134,9 @@ pub fn compare(
         add_differences(&mut rows, &sides, reference, &columns, &settings.interval);
     }
     if settings.trivial_baselines {
-        // The baselines see only the truth, so any entrant's will do.
-        for (name, set) in &first.seeds[0].baselines {
+        // They see only the truth, so any entrant's will do; the tokenizer floor is an entrant's own.
+        let trivial = first.seeds[0].baselines.iter();
+        for (name, set) in trivial.filter(|(name, _)| *name != FLOOR) {
             let side = Side {
                 sets: vec![On::of(&first.seeds[0], set, &common)],
             };
@@ -154,6 +152,7 @@ pub fn compare(
                 rows.push(row);
             }
         }
+        rows.extend(floors(entrants, &columns, &common, &settings.interval));
     }
     rows.extend(published.map(|p| p.rows(&columns)).unwrap_or_default());
     let mut table = Table {
@@ -164,6 +163,51 @@ pub fn compare(
     };
     table.mark_best();
     Ok(table)
+}
+
+/// The tokenizer floors: one row for all entrants that share their tokenizers, named after them where not all do.
+fn floors<'a>(
+    entrants: &'a [Entrant],
+    columns: &[Column],
+    common: &[String],
+    settings: &IntervalSettings,
+) -> Vec<Row> {
+    let mut found: Vec<(Vec<&'a str>, Vec<Cell>)> = Vec::new();
+    for entrant in entrants {
+        let of = |scores: &'a Scores| Some(On::of(scores, scores.baselines.get(FLOOR)?, common));
+        let sets: Vec<On> = entrant.seeds.iter().filter_map(of).collect();
+        let side = Side { sets };
+        let cells: Vec<Cell> = columns.iter().map(|c| side.cell(c, settings)).collect();
+        if cells.iter().all(|cell| cell.value.is_none()) {
+            continue;
+        }
+        // An entrant that predicts less has fewer columns of the same floor.
+        let agrees = |known: &[Cell]| {
+            let mut both = known.iter().zip(&cells);
+            both.all(|(a, b)| a.value.is_none() || b.value.is_none() || a == b)
+        };
+        match found.iter_mut().find(|(_, known)| agrees(known)) {
+            Some((names, known)) => {
+                names.push(&entrant.label);
+                for (known, cell) in known.iter_mut().zip(cells) {
+                    if known.value.is_none() {
+                        *known = cell;
+                    }
+                }
+            }
+            None => found.push((vec![&entrant.label], cells)),
+        }
+    }
+    let row = |(names, cells): (Vec<&str>, Vec<Cell>)| Row {
+        label: if names.len() == entrants.len() {
+            FLOOR.to_owned()
+        } else {
+            format!("{FLOOR}: {}", names.join(", "))
+        },
+        kind: RowKind::Baseline,
+        cells,
+    };
+    found.into_iter().map(row).collect()
 }
 
 fn columns(entrants: &[Entrant], wanted: &[String]) -> Result<Vec<Column>, CompareError> {
@@ -466,6 +510,37 @@ mod tests {
         assert!(difference.interval.unwrap().contains(5.0) && difference.p_holm.unwrap() < 0.01);
         assert!(!table.rows[0].cells[0].bold, "the intervals overlap");
         assert_eq!(table.rows[0].cells[0].n, 50, "only common clips count");
+    }
+
+    #[test]
+    fn floors_are_one_row_where_tokenizers_are_shared_and_named_where_they_are_not() {
+        let entrant = |label: &str, floor: Option<f64>| {
+            let mut own = scores(1, 0..9, 10.0);
+            if let Some(shift) = floor {
+                let set = scores(2, 0..9, shift).own;
+                own.baselines.insert(FLOOR.to_owned(), set);
+            }
+            Entrant {
+                label: label.into(),
+                seeds: vec![own],
+            }
+        };
+        let rows = |entrants: &[Entrant]| -> Vec<String> {
+            let table = compare("", entrants, &CompareSettings::default(), None).unwrap();
+            let floors = table.rows.iter().filter(|r| r.kind == RowKind::Baseline);
+            floors.map(|row| row.label.clone()).collect()
+        };
+        let (a, b, c) = (
+            entrant("a", Some(0.0)),
+            entrant("b", Some(0.0)),
+            entrant("c", Some(3.0)),
+        );
+        assert_eq!(rows(&[a.clone(), b.clone()]), ["tokenizer floor"]);
+        assert_eq!(
+            rows(&[a.clone(), b, c]),
+            ["tokenizer floor: a, b", "tokenizer floor: c"]
+        );
+        assert_eq!(rows(&[entrant("theirs", None), a]), ["tokenizer floor: a"]);
     }
 
     #[test]

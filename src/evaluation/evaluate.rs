@@ -1,13 +1,14 @@
 //! An evaluation: every clip of a suite, the trivial baselines on the same clips, and what had to be left out.
 
-use super::columns::Column;
+use super::baselines::{Means, image_centre};
+use super::columns::{Column, declared};
 use super::motion::{KinScores, frechet_distance, kin_scores, mean_cosine};
 use super::outcome::{Outcome, Refusal};
 use super::score_clip::{ClipScore, score_clip, still_camera};
-use super::scores::{ColumnScores, FORMAT, ScoreSet, Scores, SetScore};
+use super::scores::{ColumnScores, FLOOR, FORMAT, ScoreSet, Scores, SetScore};
 use super::suite::{Suite, UnknownMetric};
-use crate::clip::{Clip, Depth, GazeTrack, JointTrack};
-use ndarray::{Array1, Array2, Array3, ArrayView2, Axis};
+use crate::clip::Clip;
+use ndarray::{Array1, Array2, ArrayView2, Axis};
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 
@@ -65,7 +66,7 @@ pub enum EvaluationError {
 }
 
 /// Clips per step between two calls of `progress`; also the unit of parallel work, so results do not depend on threads.
-const CHUNK: usize = 64;
+pub(super) const CHUNK: usize = 64;
 
 /// Scores `system`'s predictions on a suite.
 ///
@@ -168,6 +169,7 @@ struct Row {
     centre: ClipScore,
     mean: ClipScore,
     mean_depth: ClipScore,
+    mean_value: ClipScore,
     floor: Option<ClipScore>,
 }
 
@@ -179,7 +181,8 @@ const BASELINES: &[(&str, BaselineOf)] = &[
     ("image centre", |row| Some(&row.centre)),
     ("mean pose", |row| Some(&row.mean)),
     ("mean depth image", |row| Some(&row.mean_depth)),
-    ("tokenizer floor", |row| row.floor.as_ref()),
+    ("mean value", |row| Some(&row.mean_value)),
+    (FLOOR, |row| row.floor.as_ref()),
 ];
 
 impl Row {
@@ -229,6 +232,7 @@ impl Row {
             Some(floor) => Some(score(columns, &floor)?),
             None => None,
         };
+        let signals: Vec<&str> = columns.iter().filter_map(|c| declared(&c.name)).collect();
         Ok(Some(Self {
             own,
             still,
@@ -238,162 +242,9 @@ impl Row {
                 &means.pose(&truth),
             )?,
             mean_depth: trivial(&["depth"], &means.depth(&truth))?,
+            mean_value: trivial(&signals, &means.declared(&truth))?,
             floor,
         }))
-    }
-}
-
-fn image_centre(truth: &Clip) -> Clip {
-    let mut clip = Clip::empty(truth.id.clone(), truth.source.clone());
-    clip.gaze = truth.gaze.as_ref().map(|gaze| GazeTrack {
-        rate: gaze.rate,
-        points: Array2::from_elem(gaze.points.raw_dim(), 0.5),
-        valid: gaze.valid.clone(),
-    });
-    clip
-}
-
-/// The mean pose and the mean depth image of the evaluated clips: baselines that know the answer's average.
-#[derive(Default)]
-struct Means {
-    body: Mean<Array2<f64>>,
-    left: Mean<Array2<f64>>,
-    right: Mean<Array2<f64>>,
-    depth: Mean<Array2<f64>>,
-}
-
-#[derive(Default, Clone)]
-struct Mean<A> {
-    sum: Option<A>,
-    count: Option<A>,
-}
-
-impl Mean<Array2<f64>> {
-    /// Adds `[T, a, b]` values where they are finite and `valid(t, a, b)`. Another `[a, b]` than the first is left alone.
-    fn add(&mut self, values: &Array3<f32>, valid: impl Fn(usize, usize) -> bool) {
-        let (_, a, b) = values.dim();
-        let sum = self.sum.get_or_insert_with(|| Array2::zeros((a, b)));
-        let count = self.count.get_or_insert_with(|| Array2::zeros((a, b)));
-        if sum.dim() != (a, b) {
-            return;
-        }
-        for ((t, i, j), value) in values.indexed_iter() {
-            if value.is_finite() && valid(t, i) {
-                sum[(i, j)] += f64::from(*value);
-                count[(i, j)] += 1.0;
-            }
-        }
-    }
-
-    fn merge(&mut self, other: Self) {
-        match (&mut self.sum, &mut self.count, other.sum, other.count) {
-            (Some(sum), Some(count), Some(more), Some(n)) if sum.dim() == more.dim() => {
-                *sum += &more;
-                *count += &n;
-            }
-            (None, None, sum, count) => (self.sum, self.count) = (sum, count),
-            _ => {}
-        }
-    }
-
-    /// The mean; where nothing was seen, the mean of everything else.
-    fn value(&self) -> Option<Array2<f64>> {
-        let (sum, count) = (self.sum.as_ref()?, self.count.as_ref()?);
-        let total = count.sum();
-        let overall = sum.sum() / total;
-        (total > 0.0).then(|| {
-            ndarray::Zip::from(sum)
-                .and(count)
-                .map_collect(|s, n| if *n > 0.0 { s / n } else { overall })
-        })
-    }
-}
-
-impl Means {
-    fn of_truth(
-        pairs: &dyn Pairs,
-        chosen: &[usize],
-        columns: &[Column],
-    ) -> Result<Self, EvaluationError> {
-        let wants =
-            |modalities: &[&str]| columns.iter().any(|c| modalities.contains(&c.modality()));
-        let (poses, depth) = (
-            wants(&["body", "hands", "left_hand", "right_hand"]),
-            wants(&["depth"]),
-        );
-        let mut all = Self::default();
-        if !poses && !depth {
-            return Ok(all);
-        }
-        for chunk in chosen.chunks(CHUNK) {
-            let parts: Vec<Result<Self, EvaluationError>> = chunk
-                .par_iter()
-                .map(|&index| {
-                    let clip = pairs.truth(index).map_err(|error| EvaluationError::Load {
-                        clip: pairs.ids()[index].clone(),
-                        error,
-                    })?;
-                    let mut part = Self::default();
-                    if poses {
-                        for (mean, track) in [
-                            (&mut part.body, &clip.body),
-                            (&mut part.left, &clip.left_hand),
-                            (&mut part.right, &clip.right_hand),
-                        ] {
-                            if let Some(track) = track {
-                                mean.add(&track.joints, |t, j| track.valid[(t, j)]);
-                            }
-                        }
-                    }
-                    if let Some(depth) = clip.depth.as_ref().filter(|_| depth) {
-                        part.depth.add(&depth.metres, |_, _| true);
-                    }
-                    Ok(part)
-                })
-                .collect();
-            for part in parts {
-                let part = part?;
-                all.body.merge(part.body);
-                all.left.merge(part.left);
-                all.right.merge(part.right);
-                all.depth.merge(part.depth);
-            }
-        }
-        Ok(all)
-    }
-
-    fn pose(&self, truth: &Clip) -> Clip {
-        let track = |track: &Option<JointTrack>, mean: &Mean<Array2<f64>>| {
-            let (track, mean) = (track.as_ref()?, mean.value()?);
-            let same = track.joints.dim().1 == mean.nrows() && track.joints.dim().2 == mean.ncols();
-            same.then(|| JointTrack {
-                joints: Array3::from_shape_fn(track.joints.dim(), |(_, j, axis)| {
-                    mean[(j, axis)] as f32
-                }),
-                ..track.clone()
-            })
-        };
-        let mut clip = Clip::empty(truth.id.clone(), truth.source.clone());
-        clip.body = track(&truth.body, &self.body);
-        clip.left_hand = track(&truth.left_hand, &self.left);
-        clip.right_hand = track(&truth.right_hand, &self.right);
-        clip
-    }
-
-    fn depth(&self, truth: &Clip) -> Clip {
-        let mut clip = Clip::empty(truth.id.clone(), truth.source.clone());
-        if let (Some(depth), Some(mean)) = (&truth.depth, self.depth.value()) {
-            let (_, h, w) = depth.metres.dim();
-            if mean.dim() == (h, w) {
-                clip.depth = Some(Depth {
-                    rate: depth.rate,
-                    metres: Array3::from_shape_fn(depth.metres.dim(), |(_, y, x)| {
-                        mean[(y, x)] as f32
-                    }),
-                });
-            }
-        }
-        clip
     }
 }
 
@@ -505,8 +356,9 @@ fn without_empty(mut set: ScoreSet) -> ScoreSet {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::clip::CameraTrack;
+    use crate::clip::{CameraTrack, Depth, GazeTrack, JointTrack};
     use nalgebra::{Isometry3, Translation3, UnitQuaternion};
+    use ndarray::Array3;
     use rand::RngExt;
 
     /// Ten walking clips and a system that adds `noise` to the truth, except where `predicted` says it did nothing.

@@ -3,8 +3,33 @@
 use super::evaluate::{LoadError, Pairs};
 use crate::clip::Clip;
 use crate::clip::store::ClipSet;
-use crate::reconstruction::predictions::Predictions;
+use crate::reconstruction::predictions::{Predictions, PredictionsError};
 use std::collections::BTreeMap;
+
+/// The tokenizer floor that predictions of a model bring with them.
+#[derive(Debug)]
+struct Floor {
+    clips: Option<Predictions>,
+    position: BTreeMap<String, usize>,
+}
+
+impl Floor {
+    fn of(predictions: &Predictions) -> Result<Self, PredictionsError> {
+        let clips = predictions.floor()?;
+        let position = clips.as_ref().map(Predictions::positions);
+        Ok(Self {
+            clips,
+            position: position.unwrap_or_default(),
+        })
+    }
+
+    fn clip(&self, id: &str) -> Result<Option<Clip>, LoadError> {
+        match (&self.clips, self.position.get(id)) {
+            (Some(clips), Some(&position)) => Ok(Some(clips.load(position)?)),
+            _ => Ok(None),
+        }
+    }
+}
 
 /// True and predicted clips in folders, matched by clip id.
 #[derive(Debug)]
@@ -14,26 +39,28 @@ pub struct Folders {
     predictions: Predictions,
     /// Position of a clip among the predictions.
     position: BTreeMap<String, usize>,
+    floor: Floor,
 }
 
 impl Folders {
     /// Every clip of `truth` is scored; predictions of other clips are left alone.
-    #[must_use]
-    pub fn new(truth: Predictions, predictions: Predictions) -> Self {
+    ///
+    /// # Errors
+    /// When the predictions bring a tokenizer floor that cannot be opened.
+    pub fn new(truth: Predictions, predictions: Predictions) -> Result<Self, PredictionsError> {
         let ids = truth
             .index
             .clips
             .iter()
             .map(|clip| clip.id.clone())
             .collect();
-        let clips = predictions.index.clips.iter().enumerate();
-        let position = clips.map(|(i, clip)| (clip.id.clone(), i)).collect();
-        Self {
+        Ok(Self {
             ids,
             truth,
+            position: predictions.positions(),
+            floor: Floor::of(&predictions)?,
             predictions,
-            position,
-        }
+        })
     }
 }
 
@@ -52,6 +79,19 @@ impl Pairs for Folders {
             None => Ok(None),
         }
     }
+
+    fn tokenizer_floor(&self, index: usize) -> Result<Option<Clip>, LoadError> {
+        self.floor.clip(&self.ids[index])
+    }
+}
+
+/// Why predictions cannot be scored against clips in shards.
+#[derive(Debug, thiserror::Error)]
+pub enum StoredError {
+    #[error("clip `{0}` was predicted but is not among the true clips")]
+    NotTrue(String),
+    #[error(transparent)]
+    Floor(#[from] PredictionsError),
 }
 
 /// True clips in shards and predictions of them, matched by clip id.
@@ -62,14 +102,15 @@ pub struct Stored {
     /// Position of a scored clip in `truth` and among the predictions.
     positions: Vec<(usize, usize)>,
     predictions: Predictions,
+    floor: Floor,
 }
 
 impl Stored {
     /// Every clip that was predicted is scored.
     ///
     /// # Errors
-    /// The id of the first prediction without a true clip.
-    pub fn new(truth: ClipSet, predictions: Predictions) -> Result<Self, String> {
+    /// A prediction without a true clip, or a tokenizer floor that cannot be opened.
+    pub fn new(truth: ClipSet, predictions: Predictions) -> Result<Self, StoredError> {
         let known: BTreeMap<&str, usize> = truth
             .ids()
             .iter()
@@ -79,7 +120,9 @@ impl Stored {
         let mut positions = Vec::new();
         let mut ids = Vec::new();
         for (index, clip) in predictions.index.clips.iter().enumerate() {
-            let position = *known.get(clip.id.as_str()).ok_or_else(|| clip.id.clone())?;
+            let position = *known
+                .get(clip.id.as_str())
+                .ok_or_else(|| StoredError::NotTrue(clip.id.clone()))?;
             positions.push((position, index));
             ids.push(clip.id.clone());
         }
@@ -87,6 +130,7 @@ impl Stored {
             ids,
             truth,
             positions,
+            floor: Floor::of(&predictions)?,
             predictions,
         })
     }
@@ -103,5 +147,9 @@ impl Pairs for Stored {
 
     fn prediction(&self, index: usize) -> Result<Option<Clip>, LoadError> {
         Ok(Some(self.predictions.load(self.positions[index].1)?))
+    }
+
+    fn tokenizer_floor(&self, index: usize) -> Result<Option<Clip>, LoadError> {
+        self.floor.clip(&self.ids[index])
     }
 }

@@ -2,7 +2,8 @@
 //!
 //! Read in this order: [`outcome`] (what a metric can say), the metrics [`joints`], [`trajectory`], [`gaze`], [`depth`],
 //! [`motion`], [`tokens`], [`runtime`]; then [`evaluate`] (every clip of a [`suite`] into [`scores`]), [`statistics`], and [`compare`]
-//! (many scores into one [`table`], which [`render`] prints). [`tum`] compares trajectory files.
+//! (many scores into one [`table`], which [`render`] prints and
+//! [`intervals`] draws). [`tum`] compares trajectory files.
 //!
 //! Arithmetic is f64; inputs are metres and seconds; angles are reported in degrees.
 
@@ -15,12 +16,14 @@
     reason = "signals of a clip are optional fields, handed on as they are"
 )]
 
+mod baselines;
 pub mod columns;
 pub mod compare;
 pub mod depth;
 pub mod evaluate;
 pub mod folders;
 pub mod gaze;
+pub mod intervals;
 pub mod joints;
 pub mod motion;
 pub mod outcome;

@@ -40,7 +40,7 @@ pub fn render(table: &Table, format: Format) -> String {
 }
 
 /// Four significant digits, without an exponent for ordinary sizes.
-fn number(value: f64) -> String {
+pub(super) fn number(value: f64) -> String {
     if value == 0.0 {
         return "0".to_owned();
     }

@@ -17,7 +17,7 @@ pub struct Scores {
     /// Clip ids, in the order of every column's values.
     pub clips: Vec<String>,
     pub own: ScoreSet,
-    /// `still camera`, `image centre`, `mean pose`, `mean depth image`, `tokenizer floor`: only the columns they have.
+    /// `still camera`, `image centre`, `mean pose`, `mean depth image`, `mean value`, `tokenizer floor`: only the columns they have.
     pub baselines: BTreeMap<String, ScoreSet>,
     /// Clips that were not scored, by reason.
     pub left_out: BTreeMap<String, usize>,
@@ -26,6 +26,9 @@ pub struct Scores {
     /// How clips were drawn, if not all were taken.
     pub sample: Option<super::sample::Sample>,
 }
+
+/// The baseline that belongs to the system: the truth after a round trip through its tokenizers.
+pub const FLOOR: &str = "tokenizer floor";
 
 /// The current [`Scores::format`].
 pub const FORMAT: u32 = 1;

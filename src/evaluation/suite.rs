@@ -16,8 +16,6 @@ pub struct Suite {
     /// Ground-truth depth at or beyond this many metres is not scored.
     #[schemars(range(min = 0.001))]
     pub depth_max: Option<f64>,
-    /// Published rows that stand beside the table, a registry entry of kind `published`.
-    pub published: Option<String>,
 }
 
 impl Default for Suite {
@@ -43,7 +41,6 @@ impl Default for Suite {
             metrics: metrics.map(str::to_owned).to_vec(),
             sample: None,
             depth_max: None,
-            published: None,
         }
     }
 }

@@ -8,7 +8,7 @@ use ndarray::ArrayD;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-/// A modality as a registry entry of kind `modality` declares it.
+/// What a modality declared in a registry entry is, as clips carry it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct DeclaredSettings {
@@ -23,15 +23,9 @@ pub struct DeclaredSettings {
     /// How the tokenizer scales the values.
     #[serde(default)]
     pub normalize: Normalize,
-    /// The tokenizer to train for it: the name of a registry entry, or `use:` with changes.
-    #[serde(default)]
-    pub tokenizer: Option<serde_json::Value>,
     /// Where clips get it from.
     #[serde(default)]
     pub source: SignalSource,
-    /// Metrics that score it.
-    #[serde(default)]
-    pub metrics: Vec<String>,
 }
 
 /// Rate, channels and units of a declared modality.
@@ -89,6 +83,8 @@ pub struct SignalSource {
     pub key: Option<String>,
     /// A sensor of the built-in world instead: `head_imu`.
     pub world: Option<String>,
+    /// Code of a plug-in crate that makes it from the other signals of the clip, by name.
+    pub code: Option<String>,
 }
 
 /// A modality from [`DeclaredSettings`].
@@ -237,9 +233,7 @@ mod tests {
                 "missing": "nan"
             },
             "normalize": "standard",
-            "tokenizer": {"use": "vq_temporal", "codebook": 512},
-            "source": {"npz": "imu.npz", "key": "imu"},
-            "metrics": ["rmse"]
+            "source": {"npz": "imu.npz", "key": "imu"}
         }))
         .unwrap()
     }

@@ -76,9 +76,7 @@ impl ClipFormat {
                     missing: crate::modality::declared::Missing::Nan,
                 },
                 normalize: Normalize::default(),
-                tokenizer: None,
                 source: SignalSource::default(),
-                metrics: Vec::new(),
             });
         }
         format

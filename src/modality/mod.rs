@@ -1,9 +1,11 @@
 //! Modalities: what a signal is, and how it comes out of a [`Clip`] (Sec. 3, 4.2).
 //!
 //! [`built_in`] gives the seven of the paper at the sizes of a [`ClipFormat`]; [`declared`] makes one from a YAML entry.
-//! Read [`camera`] first, it is the most interesting conversion. [`inventory`] counts what clips hold.
+//! Read [`camera`] first, it is the most interesting conversion. [`code`] is how a plug-in crate computes a declared one,
+//! [`inventory`] counts what clips hold.
 
 pub mod camera;
+pub mod code;
 pub mod declared;
 pub mod format;
 pub mod gaze;
@@ -68,7 +70,8 @@ pub enum Shape {
 
 /// A kind of signal that takes part in training and reconstruction.
 ///
-/// Built-in: `rgb depth camera gaze left_hand right_hand body`. Others are declared in YAML or submitted by plug-in crates.
+/// Built-in: `rgb depth camera gaze left_hand right_hand body`. Others are declared in YAML, with values
+/// from files or from the [`code`] of a plug-in crate.
 pub trait Modality: Send + Sync {
     /// The registry name.
     fn name(&self) -> &str;

@@ -11,6 +11,7 @@ pub use settings::{ClipsSettings, SourceSettings};
 use settings::MARKERS;
 use splits::{deliver, parts, refused};
 
+use super::modality_entry::{self, DEFAULTS};
 use crate::experiment::artifact::{ArtifactKind, Description, SignalFacts};
 use crate::experiment::context::{StageContext, StageError};
 use crate::experiment::problem::{Code, Problem};
@@ -18,7 +19,6 @@ use crate::experiment::stage::{Inputs, Op, OpEntry, Port, StagePlan};
 use crate::modality::{self, Modality, Shape};
 use crate::source::convert::{ConvertSettings, convert};
 use crate::source::shards::TarSink;
-use crate::source::world::clips::{SENSORS, sensor_of};
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::ops::ControlFlow;
@@ -100,29 +100,10 @@ impl Op for Clips {
             problems.push(Problem::new(Code::E0206, "depth", reason));
         }
         for (i, entry) in settings.declared.iter().enumerate() {
-            if let Some((key, reason)) = entry.settings.problem() {
-                problems.push(Problem::new(
-                    Code::E0206,
-                    format!("declared.{i}.{key}"),
-                    reason,
-                ));
-            }
-            if source.data.is_some() {
-                if entry.settings.source.npz.is_none() {
-                    let message = format!("`{}` does not say where recordings have it", entry.name);
-                    problems.push(
-                        Problem::new(Code::E0204, format!("declared.{i}"), message)
-                            .help("`source: {npz: FILE, key: ARRAY}`, a file of each recording"),
-                    );
-                }
-                continue;
-            }
-            let sensor = sensor_of(&entry.name, &entry.settings);
-            if !SENSORS.contains(&sensor) {
-                let message = format!("the built-in world has no sensor `{sensor}`");
-                let help = format!("it has {}", SENSORS.map(|s| format!("`{s}`")).join(", "));
-                problems
-                    .push(Problem::new(Code::E0203, format!("declared.{i}"), message).help(help));
+            let from_world = source.data.is_none();
+            for mut problem in modality_entry::problems(entry, from_world) {
+                problem.key = format!("declared.{i}{}", problem.key);
+                problems.push(problem);
             }
         }
         if settings.splits().next().is_none() {
@@ -146,7 +127,10 @@ impl Op for Clips {
                     (m.name().to_owned(), facts)
                 })
                 .collect(),
-            extra: BTreeMap::from([("format".to_owned(), json!(format))]),
+            extra: BTreeMap::from([
+                ("format".to_owned(), json!(format)),
+                (DEFAULTS.to_owned(), json!(settings.defaults())),
+            ]),
             ..Description::default()
         }
     }
@@ -223,7 +207,9 @@ impl Op for Clips {
             let folder = context.checkpoints().join("clips").join(split);
             deliver(&folder, &context.output().join(split))?;
         }
-        Ok(json!({ "source": name, "format": format, "splits": splits }))
+        Ok(json!({
+            "source": name, "format": format, "splits": splits, (DEFAULTS): settings.defaults(),
+        }))
     }
 }
 

@@ -3,6 +3,7 @@
 //! Truth and predictions are folders of [`crate::reconstruction::predictions`]: those of other systems stand in `data.yaml` by
 //! name, so that EgoAllo, HaMeR or EgoM2P can be rows that we computed.
 
+use super::modality_entry::{DEFAULTS, read_defaults};
 use crate::clip::store::ClipSet;
 use crate::evaluation::compare::{CompareSettings, Entrant, compare};
 use crate::evaluation::evaluate::Pairs;
@@ -70,7 +71,7 @@ impl Op for Evaluate {
     }
 
     fn version(&self) -> u32 {
-        1
+        2
     }
 
     fn about(&self) -> &'static str {
@@ -149,7 +150,10 @@ impl Op for Evaluate {
                 .help("name a stage in `clips`, or a data set of `data.yaml` in `truth_data`"),
             );
         }
-        match settings.suite.settings.columns() {
+        let predicted = inputs.one("predictions").map(|p| p.signals.keys());
+        let defaults = inputs.one("clips").and_then(|c| c.extra.get(DEFAULTS));
+        let suite = suite(settings, defaults, predicted.into_iter().flatten());
+        match suite.columns() {
             Ok(columns) => Description {
                 columns: columns.into_iter().map(|c| c.name).collect(),
                 ..Description::default()
@@ -186,23 +190,26 @@ impl Op for Evaluate {
             .system
             .clone()
             .unwrap_or_else(|| predictions.index.system.clone());
+        let clips = context.inputs("clips").first();
+        let suite = suite(
+            settings,
+            clips.and_then(|clips| clips.contents.get(DEFAULTS)),
+            predictions.index.signals.keys(),
+        );
         let pairs: Box<dyn Pairs> = if let Some(clips) = context.inputs("clips").first() {
             let root = clips.path.join(&settings.split);
             let truth = ClipSet::open(&root).map_err(StageError::other)?;
-            let stored = Stored::new(truth, predictions).map_err(|id| {
-                input(
-                    &format!("clip `{id}` was predicted but is not among the true clips"),
-                    "predict the split that `split` names",
-                )
+            let stored = Stored::new(truth, predictions).map_err(|error| {
+                input(&error.to_string(), "predict the split that `split` names")
             })?;
             Box::new(stored)
         } else {
             let truth = open(data_root(context, &settings.truth_data)?)?;
-            Box::new(Folders::new(truth, predictions))
+            Box::new(Folders::new(truth, predictions).map_err(StageError::other)?)
         };
         let outcome = evaluate(
             &settings.suite.name,
-            &settings.suite.settings,
+            &suite,
             &system,
             pairs.as_ref(),
             embeddings.as_ref(),
@@ -241,6 +248,26 @@ impl Op for Evaluate {
         )?;
         Ok(json!({"suite": settings.suite.name, "system": system, "clips": clips}))
     }
+}
+
+/// The suite, and beside it what the entries of declared modalities say should score them, where they were predicted.
+fn suite<'a>(
+    settings: &EvaluateSettings,
+    defaults: Option<&Value>,
+    predicted: impl Iterator<Item = &'a String>,
+) -> Suite {
+    let mut suite = settings.suite.settings.clone();
+    let defaults = read_defaults(defaults);
+    for name in predicted {
+        let metrics = defaults.get(name).map(|of| of.metrics.as_slice());
+        for metric in metrics.unwrap_or_default() {
+            let column = format!("{name}.{metric}");
+            if !suite.metrics.contains(&column) {
+                suite.metrics.push(column);
+            }
+        }
+    }
+    suite
 }
 
 fn input(message: &str, help: &str) -> StageError {

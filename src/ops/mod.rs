@@ -5,6 +5,7 @@ pub mod clips;
 mod evaluate;
 mod import;
 mod kinds;
+mod modality_entry;
 mod predict;
 mod reconstruct;
 mod statistics;

@@ -1,21 +1,26 @@
 //! `op: predict`: a model generates what it was not given, for every clip of a split (Supp. C).
 //!
-//! Writes a folder of [`crate::reconstruction::predictions`]: decoded signals with a confidence per sample.
+//! Writes a folder of [`crate::reconstruction::predictions`]: decoded signals with a confidence per sample, and beside it the
+//! tokenizer floor: the clips' own signals after a round trip through the model's tokenizers.
 
 use crate::clip::Clip;
 use crate::clip::store::ClipSet;
 use crate::decoding::{DecodingSettings, Reconstructor, ReconstructorError, Wish};
 use crate::engine::Compute;
+use crate::evaluation::runtime::runtime;
 use crate::experiment::{
     Arity, ArtifactKind, Code, Description, Entry, InputArtifact, Inputs, Op, OpEntry, Port,
     Problem, StageContext, StageError, StagePlan,
 };
 use crate::masking::PIXELS;
-use crate::reconstruction::predictions::{PredictionsWriter, ScaleStatus, SignalNote};
+use crate::reconstruction::predictions::{FLOOR, PredictionsWriter, ScaleStatus, SignalNote};
+use crate::run::environment::Stopwatch;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
+use std::fmt::Write as _;
+use std::path::Path;
 
 /// Clips that go through the model at once.
 const BATCH: usize = 8;
@@ -35,6 +40,8 @@ pub struct PredictSettings {
     /// At most this many clips, the first ones; absent means all.
     #[schemars(range(min = 1))]
     pub limit: Option<usize>,
+    /// Also write the tokenizer floor, which `evaluate` shows beside every metric.
+    pub floor: bool,
 }
 
 impl Default for PredictSettings {
@@ -48,6 +55,7 @@ impl Default for PredictSettings {
             },
             split: "test".to_owned(),
             limit: None,
+            floor: true,
         }
     }
 }
@@ -76,7 +84,7 @@ impl Op for Predict {
     }
 
     fn version(&self) -> u32 {
-        1
+        2
     }
 
     fn about(&self) -> &'static str {
@@ -208,31 +216,69 @@ impl Op for Predict {
             seed: context.seed(),
         };
         let notes = notes(&reconstructor, &targets).map_err(refused)?;
-        let mut writer = PredictionsWriter::create(context.output(), "reviv", notes)
-            .map_err(StageError::other)?;
-        let given: Vec<&str> = settings.given.iter().map(String::as_str).collect();
+        let create = |folder: &Path, system: &str| {
+            PredictionsWriter::create(folder, system, notes.clone()).map_err(StageError::other)
+        };
+        let mut writer = create(context.output(), "reviv")?;
+        let mut floor = None;
+        if settings.floor {
+            floor = Some(create(&context.output().join(FLOOR), "tokenizer floor")?);
+        }
+        let mut read: Vec<&str> = settings.given.iter().map(String::as_str).collect();
+        if settings.floor {
+            read.extend(targets.iter().map(String::as_str));
+        }
+        let mut times = Times::default();
         let mut done = 0;
         while done < total {
             if context.interrupted() {
                 return Err(StageError::Interrupted);
             }
-            let batch = (done..total.min(done + BATCH))
-                .map(|index| clips.clip_with(index, &given))
-                .collect::<Result<Vec<Clip>, _>>()
+            let count = BATCH.min(total - done);
+            let batch = times
+                .take("read", count, || {
+                    let range = done..done + count;
+                    let clips = range.map(|index| clips.clip_with(index, &read));
+                    clips.collect::<Result<Vec<Clip>, _>>()
+                })
                 .map_err(StageError::other)?;
-            let ids: Vec<u64> = (done..).take(batch.len()).map(|i| i as u64).collect();
-            let made = reconstructor
-                .reconstruct(&batch, &ids, &wish)
+            let ids: Vec<u64> = (done..done + count).map(|i| i as u64).collect();
+            let seen = times
+                .take("encode", count, || reconstructor.see(&batch, wish.given))
+                .map_err(refused)?;
+            let tokens = times
+                .take("generate", count, || {
+                    reconstructor.generate(&seen, &ids, &wish)
+                })
+                .map_err(refused)?;
+            let made = times
+                .take("detokenize", count, || {
+                    reconstructor.decode(&batch, &tokens, &targets)
+                })
                 .map_err(refused)?;
             for one in made {
                 writer
                     .add(&one.clip, &one.confidence)
                     .map_err(StageError::other)?;
             }
-            done += batch.len();
+            if let Some(floor) = &mut floor {
+                let back = reconstructor
+                    .round_trip(&batch, &targets)
+                    .map_err(refused)?;
+                for clip in back {
+                    floor
+                        .add(&clip, &BTreeMap::new())
+                        .map_err(StageError::other)?;
+                }
+            }
+            done += count;
             context.progress(done as u64, total as u64, "clips");
         }
         writer.finish().map_err(StageError::other)?;
+        if let Some(floor) = floor {
+            floor.finish().map_err(StageError::other)?;
+        }
+        times.record(context, done)?;
         Ok(json!({
             "split": settings.split,
             "clips": total,
@@ -240,6 +286,44 @@ impl Op for Predict {
             "generated": targets,
             "decoding": settings.decoding.name,
         }))
+    }
+}
+
+/// Seconds per clip by part of the work, one number per batch.
+#[derive(Debug, Default)]
+struct Times(BTreeMap<&'static str, Vec<f64>>);
+
+impl Times {
+    fn take<T>(&mut self, part: &'static str, clips: usize, work: impl FnOnce() -> T) -> T {
+        let watch = Stopwatch::start();
+        let made = work();
+        let each = watch.seconds() / clips.max(1) as f64;
+        self.0.entry(part).or_default().push(each);
+        made
+    }
+
+    /// Into the record of the run: what the clock says is no part of an artifact.
+    fn record(&self, context: &mut dyn StageContext, clips: usize) -> Result<(), StageError> {
+        let mut text = String::from(
+            "| seconds per clip | median | mean | p90 | batches |\n|---|---|---|---|---|\n",
+        );
+        for (part, seconds) in &self.0 {
+            // The first batch warms up, where there are others.
+            let found = runtime(seconds, usize::from(seconds.len() > 1));
+            if let (Some(median), Some(mean), Some(p90)) = (found.median, found.mean, found.p90) {
+                let n = found.n;
+                let _ = writeln!(
+                    text,
+                    "| {part} | {median:.4} | {mean:.4} | {p90:.4} | {n} |"
+                );
+                context.record(
+                    clips as u64,
+                    &[(&format!("seconds_per_clip/{part}"), median)],
+                )?;
+            }
+        }
+        let _ = writeln!(text, "\nBatches of {BATCH} clips on the CPU.");
+        context.record_text(clips as u64, "time", &text)
     }
 }
 

@@ -1,8 +1,9 @@
 //! `op: table`: scores of several systems in one table, paired on common clips. Writes `table.json`, `table.csv`, `table.tex`
-//! and the table of the report page.
+//! and, for the report page, the table and its intervals as a plot.
 
 use super::evaluate::write_text;
 use crate::evaluation::compare::{CompareSettings, Entrant, compare};
+use crate::evaluation::intervals;
 use crate::evaluation::published::Published;
 use crate::evaluation::render::{Format, render};
 use crate::evaluation::scores::Scores;
@@ -41,7 +42,7 @@ impl Op for TableOp {
     }
 
     fn version(&self) -> u32 {
-        1
+        2
     }
 
     fn about(&self) -> &'static str {
@@ -119,6 +120,9 @@ impl Op for TableOp {
         write_text(output, "table.csv", &render(&table, Format::Csv))?;
         write_text(output, "table.tex", &render(&table, Format::Latex))?;
         write_text(output, "report/table.md", &render(&table, Format::Markdown))?;
+        if let Some(plot) = intervals::svg(&table) {
+            write_text(output, "report/table_intervals.svg", &plot)?;
+        }
         Ok(json!({"rows": table.rows.len(), "columns": table.columns.len()}))
     }
 }

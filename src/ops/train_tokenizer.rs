@@ -11,6 +11,7 @@ mod run;
 mod scores;
 
 use super::clip_signals::{described_format, modality, unknown_modality};
+use super::modality_entry::{DEFAULTS, read_defaults};
 use super::tokenizer_entry::TokenizerEntry;
 use crate::engine::{Compute, DeviceChoice, Initialise, Parameters, Precision};
 use crate::experiment::{
@@ -33,8 +34,8 @@ use serde_json::{Value, json};
 pub struct TrainTokenizerSettings {
     /// The modality: `rgb depth camera gaze left_hand right_hand body`, or a declared one.
     pub modality: String,
-    /// Family and sizes.
-    pub tokenizer: Entry<TokenizerEntry>,
+    /// Family and sizes; absent: what the entry of a declared modality names.
+    pub tokenizer: Option<Entry<TokenizerEntry>>,
     /// Optimizer steps.
     #[schemars(range(min = 1))]
     pub steps: u64,
@@ -68,10 +69,7 @@ impl Default for TrainTokenizerSettings {
         let training = TokenizerTraining::default();
         Self {
             modality: String::new(),
-            tokenizer: Entry {
-                name: "vq_temporal_small".to_owned(),
-                settings: TokenizerEntry::default(),
-            },
+            tokenizer: None,
             steps: training.steps,
             batch: training.batch,
             rate: training.rate,
@@ -96,6 +94,12 @@ impl TrainTokenizerSettings {
             warmup: self.warmup,
             optimizer: self.optimizer.clone(),
         }
+    }
+
+    /// The tokenizer that is named here, or else by the entry of the modality, as a clips artifact passes it on.
+    fn entry(&self, defaults: Option<&Value>) -> Option<Entry<TokenizerEntry>> {
+        let named = self.tokenizer.clone();
+        named.or_else(|| read_defaults(defaults).remove(&self.modality)?.tokenizer)
     }
 
     /// The hand whose mirror image trains too.
@@ -192,22 +196,25 @@ impl Op for TrainTokenizer {
             let problem = Problem::new(Code::W0701, "clips", "no held-out clips to score on");
             problems.push(problem.help("give the clips stage `validation:` a number"));
         }
-        match tokens(&settings.tokenizer.settings, &modality.shape()) {
+        let family = match modality.shape() {
+            Shape::Temporal { .. } => "signals over time take `vq_temporal_small` and its like",
+            Shape::Kinematic { .. } => "joints take `vq_kinematic_small` and its like",
+            Shape::Video { .. } => "video takes `video_small` and its like",
+        };
+        let Some(entry) = settings.entry(clips.extra.get(DEFAULTS)) else {
+            let message = format!("no tokenizer is named for `{}`", settings.modality);
+            problems.push(Problem::new(Code::E0204, "tokenizer", message).help(family));
+            return Description::default();
+        };
+        match tokens(&entry.settings, &modality.shape()) {
             Ok(tokens) => Description {
                 tokens: [(settings.modality.clone(), tokens)].into(),
                 signals: [(settings.modality.clone(), facts.clone())].into(),
-                extra: [("tokenizer".to_owned(), json!(settings.tokenizer.name))].into(),
+                extra: [("tokenizer".to_owned(), json!(entry.name))].into(),
                 ..Description::default()
             },
             Err(message) => {
-                let help = match modality.shape() {
-                    Shape::Temporal { .. } => {
-                        "signals over time take `vq_temporal_small` and its like"
-                    }
-                    Shape::Kinematic { .. } => "joints take `vq_kinematic_small` and its like",
-                    Shape::Video { .. } => "video takes `video_small` and its like",
-                };
-                problems.push(Problem::new(Code::E0401, "tokenizer", message).help(help));
+                problems.push(Problem::new(Code::E0401, "tokenizer", message).help(family));
                 Description::default()
             }
         }
@@ -226,7 +233,13 @@ impl Op for TrainTokenizer {
         let Some(modality) = modality(&format, &settings.modality) else {
             return StagePlan::default();
         };
-        let (entry, shape) = (&settings.tokenizer.settings, modality.shape());
+        let defaults = inputs
+            .one("clips")
+            .and_then(|clips| clips.extra.get(DEFAULTS));
+        let Some(entry) = settings.entry(defaults) else {
+            return StagePlan::default();
+        };
+        let (entry, shape) = (&entry.settings, modality.shape());
         let Ok(tokens) = tokens(entry, &shape) else {
             return StagePlan::default();
         };

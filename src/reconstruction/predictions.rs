@@ -74,6 +74,8 @@ pub struct PredictedClip {
     pub file: String,
 }
 
+/// The folder beside the index with the truth after a round trip through the model's tokenizers, itself of this form.
+pub const FLOOR: &str = "floor";
 /// The index's file name.
 pub const INDEX: &str = "predictions.json";
 /// The current [`PredictionsIndex::format`].
@@ -226,6 +228,26 @@ impl Predictions {
             directory: directory.to_owned(),
             index,
         })
+    }
+
+    /// The tokenizer floor of the same clips; `None` where the system has none.
+    ///
+    /// # Errors
+    /// As [`Predictions::open`].
+    pub fn floor(&self) -> Result<Option<Self>, PredictionsError> {
+        let folder = self.directory.join(FLOOR);
+        folder
+            .join(INDEX)
+            .is_file()
+            .then(|| Self::open(&folder))
+            .transpose()
+    }
+
+    /// The position of every clip of the index, by id.
+    #[must_use]
+    pub fn positions(&self) -> BTreeMap<String, usize> {
+        let clips = self.index.clips.iter().enumerate();
+        clips.map(|(i, clip)| (clip.id.clone(), i)).collect()
     }
 
     /// The signals of the clip at `position` of the index.

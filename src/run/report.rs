@@ -23,6 +23,8 @@ use std::path::Path;
 
 /// The comparison of a sweep's arms, beside the page.
 pub const TABLE: &str = "table.md";
+/// The same as a plot, beside it.
+pub const PLOT: &str = "table_intervals.svg";
 /// Larger pieces are named, not shown.
 const LARGEST_PIECE: u64 = 8 << 20;
 /// More plots than anyone looks at make a page slow.
@@ -103,6 +105,16 @@ fn comparison(page: &mut String, directory: &RunDirectory) {
     if let (true, Ok(text)) = (small, std::fs::read_to_string(&path)) {
         page.push_str("<h2>Comparison</h2>\n");
         page.push_str(&html(&text));
+    }
+    let path = directory.path().join("report").join(PLOT);
+    let small = std::fs::metadata(&path).is_ok_and(|meta| meta.len() <= LARGEST_PIECE);
+    if let (true, Ok(plot)) = (small, std::fs::read(&path)) {
+        image(
+            page,
+            "svg+xml",
+            &plot,
+            "Every row of the comparison with its interval",
+        );
     }
 }
 

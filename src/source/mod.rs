@@ -17,6 +17,7 @@
 
 pub mod adt;
 pub mod aria;
+pub mod coded;
 pub mod convert;
 pub mod csv;
 pub mod cut;

@@ -49,7 +49,8 @@ fn the_arrays_of_egom2p_are_scored_against_their_truth() {
     let folders = Folders::new(
         Predictions::open(&truth).unwrap(),
         Predictions::open(&guess).unwrap(),
-    );
+    )
+    .unwrap();
     let suite = Suite {
         metrics: ["camera.ate", "camera.rte", "camera.rre", "gaze.mse"]
             .map(str::to_owned)

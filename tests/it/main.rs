@@ -1,6 +1,7 @@
 //! One integration test binary, a file per command or promise.
 #![allow(clippy::unwrap_used)] // A test that cannot go on should stop where it is.
 
+mod adt_evaluation;
 mod bad_input;
 mod bad_input_binary;
 mod data;
@@ -9,6 +10,7 @@ mod egom2p_examples;
 mod evaluation;
 mod full_disk;
 mod metrics;
+mod modality_plugin;
 mod odd_videos;
 mod parity;
 mod readers_bad;

@@ -1,5 +1,8 @@
 //! The schema for editors: what is checked in is what the binary writes, and it takes what the language takes.
 
+use reviv::evaluation::columns::Column;
+use reviv::evaluation::published::Published;
+use reviv::evaluation::suite::Suite;
 use reviv::experiment::catalog::Catalog;
 use reviv::experiment::schema;
 use std::path::Path;
@@ -81,4 +84,86 @@ fn every_shipped_experiment_is_sound() {
             .collect();
         assert!(wrong.is_empty(), "{}", report.render(false));
     }
+}
+
+#[test]
+fn every_metric_that_anything_shipped_names_is_a_column() {
+    let catalog = Catalog::linked();
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let registry = reviv::experiment::registry::Registry::new(&catalog, None);
+    let entry = |kind: &str, name: &str| {
+        let value = reviv::experiment::load::entry(&catalog, &root.join("x.yaml"), kind, name);
+        value.unwrap_or_else(|| panic!("{kind} {name}"))
+    };
+    let (mut suites, mut published) = (0, 0);
+    for listed in registry.list(Some("suite")) {
+        let suite: Suite = serde_json::from_value(entry("suite", &listed.name)).unwrap();
+        let columns = suite
+            .columns()
+            .unwrap_or_else(|error| panic!("{}: {error}", listed.name));
+        assert!(
+            columns.len() >= suite.metrics.len() && !columns.is_empty(),
+            "{}",
+            listed.name
+        );
+        suites += 1;
+    }
+    for listed in registry.list(Some("published")) {
+        let rows: Published = serde_json::from_value(entry("published", &listed.name)).unwrap();
+        assert!(!rows.rows.is_empty() && !rows.source.is_empty() && !rows.conditions.is_empty());
+        for (row, name) in rows
+            .rows
+            .iter()
+            .flat_map(|r| r.values.keys().map(move |k| (r, k)))
+        {
+            let column = Column::named(name);
+            assert!(
+                column.is_some(),
+                "{}: {}: `{name}`",
+                listed.name,
+                row.system
+            );
+        }
+        published += 1;
+    }
+    assert!(suites >= 15 && published >= 10);
+    // What a sweep compares is what its evaluations compute, and its published rows have a number in it.
+    let mut sweeps = 0;
+    for (path, _) in catalog.experiments() {
+        let request = reviv::experiment::load::Request {
+            path: root.join(path),
+            data_may_be_absent: true,
+            ..Default::default()
+        };
+        let (experiment, _) = reviv::experiment::load::load(&catalog, &request);
+        let Some((experiment, compare)) =
+            experiment.and_then(|e| e.compare.clone().map(|c| (e, c)))
+        else {
+            continue;
+        };
+        sweeps += 1;
+        let stages = || experiment.cells.iter().flat_map(|cell| &cell.graph.stages);
+        for pattern in &compare.columns {
+            let computed = stages()
+                .flat_map(|stage| &stage.description.columns)
+                .any(|name| Column::named(name).is_some_and(|c| c.answers_to(pattern)));
+            assert!(computed, "{path}: `{pattern}` is computed by no stage");
+        }
+        let Some(name) = &compare.against else {
+            continue;
+        };
+        let rows: Published = serde_json::from_value(entry("published", name)).unwrap();
+        let columns: Vec<Column> = rows
+            .rows
+            .iter()
+            .flat_map(|row| row.values.keys())
+            .filter_map(|name| Column::named(name))
+            .collect();
+        let beside = |pattern: &String| columns.iter().any(|c| c.answers_to(pattern));
+        assert!(
+            compare.columns.iter().any(beside),
+            "{path}: `{name}` stands beside nothing"
+        );
+    }
+    assert!(sweeps >= 5, "{sweeps}");
 }

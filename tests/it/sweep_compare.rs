@@ -73,6 +73,42 @@ fn the_arms_of_a_sweep_are_compared_on_its_page() {
     for name in ["table.md", "table.tex", "table.csv"] {
         assert!(page.with_file_name(name).is_file(), "{name}");
     }
+    // The intervals are drawn, with the published row as context.
+    assert!(text.contains("Every row of the comparison with its interval"));
+    let plot = std::fs::read_to_string(page.with_file_name("table_intervals.svg")).unwrap();
+    for row in ["near", "far", "(image centre)", "ReViV (published)"] {
+        assert!(plot.contains(row), "{row}");
+    }
+    let run_name = page.ancestors().nth(2).unwrap().to_owned();
+    let compared = Command::new(env!("CARGO_BIN_EXE_reviv"))
+        .args([
+            "compare",
+            "--against",
+            "adt_gaze",
+            "--plot",
+            "plot.svg",
+            "--format",
+            "md",
+        ])
+        .arg(&run_name)
+        .current_dir(folder.path())
+        .output()
+        .unwrap();
+    let table = String::from_utf8_lossy(&compared.stdout).into_owned();
+    assert!(
+        compared.status.success(),
+        "{}",
+        String::from_utf8_lossy(&compared.stderr)
+    );
+    assert!(
+        table.contains("published rows (context, not comparable)"),
+        "{table}"
+    );
+    assert!(
+        std::fs::read_to_string(at("plot.svg"))
+            .unwrap()
+            .contains("ReViV (published)")
+    );
     // Asked again: nothing to do, the same page.
     let again = run(folder.path());
     assert!(String::from_utf8_lossy(&again.stderr).contains("done before"));

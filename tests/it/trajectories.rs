@@ -35,3 +35,41 @@ fn trajectory_errors_equal_those_of_evo() {
         }
     }
 }
+
+/// The command of the guide: `reviv compare --trajectory REFERENCE ESTIMATE`.
+#[test]
+fn one_command_prints_the_numbers_of_evo() {
+    let Some(shared) = crate::shared::folder() else {
+        return;
+    };
+    let data = shared.join("data");
+    let text = std::fs::read_to_string(data.join("refs/freiburg1_xyz-rgbdslam.evo.json")).unwrap();
+    let evo: serde_json::Value = serde_json::from_str(&text).unwrap();
+    let compare = |extra: &[&str]| {
+        let output = std::process::Command::new(env!("CARGO_BIN_EXE_reviv"))
+            .args(["compare", "--trajectory"])
+            .arg(data.join("trajectories/freiburg1_xyz-groundtruth.txt"))
+            .arg(data.join("trajectories/freiburg1_xyz-rgbdslam.txt"))
+            .args(extra)
+            .output()
+            .unwrap();
+        assert!(output.status.success());
+        String::from_utf8(output.stdout).unwrap()
+    };
+    let ours: serde_json::Value = serde_json::from_str(&compare(&["--json"])).unwrap();
+    assert_eq!(ours["pairs"], evo["pairs"]);
+    let number = |value: &serde_json::Value| value.as_f64().unwrap();
+    for freedom in ["se3", "sim3"] {
+        for name in ["ate_rmse_m", "rpe_trans_m_rmse", "rpe_rot_deg_rmse"] {
+            let theirs = number(&evo[format!("{name}_{freedom}")]);
+            let ours = number(&ours[freedom][name]);
+            assert!(
+                (ours - theirs).abs() < 1e-9 * theirs,
+                "{name}_{freedom}: {ours} against {theirs}"
+            );
+        }
+    }
+    assert!((number(&ours["sim3"]["scale"]) - number(&evo["sim3_scale"])).abs() < 1e-9);
+    // The printed table has the same digits.
+    assert!(compare(&[]).contains("0.013470088849"), "ATE, rigid");
+}

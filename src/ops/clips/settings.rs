@@ -2,7 +2,8 @@
 
 use crate::clip::depth_video::DepthCoding;
 use crate::experiment::entry::{Entry, Kind, KindEntry};
-use crate::modality::{ClipFormat, DeclaredSettings};
+use crate::modality::ClipFormat;
+use crate::ops::modality_entry::{self, Defaults, ModalityEntry};
 use crate::source::open::Dataset;
 use crate::source::recording::CutSettings;
 use crate::source::split::SplitSettings;
@@ -43,13 +44,7 @@ impl Kind for SourceSettings {
     const ABOUT: &'static str = "Where clips come from: the built-in world, or recordings.";
 }
 
-impl Kind for DeclaredSettings {
-    const KIND: &'static str = "modality";
-    const ABOUT: &'static str = "Signals beyond the built-in ones, declared in YAML.";
-}
-
 inventory::submit! { KindEntry::of::<SourceSettings>() }
-inventory::submit! { KindEntry::of::<DeclaredSettings>() }
 
 /// Settings of `op: clips`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -71,7 +66,7 @@ pub struct ClipsSettings {
     pub depth: DepthCoding,
     /// Modalities beyond the built-in ones, by registry name.
     #[serde(default)]
-    pub declared: Vec<Entry<DeclaredSettings>>,
+    pub declared: Vec<Entry<ModalityEntry>>,
 }
 
 /// The first clip number of each split: far apart, so that the size of one split never changes another.
@@ -103,15 +98,17 @@ impl ClipsSettings {
 
     /// The sizes of the clips.
     pub fn format(&self) -> ClipFormat {
-        let declared = self.declared.iter().map(|entry| DeclaredSettings {
-            name: entry.name.clone(),
-            ..entry.settings.clone()
-        });
+        let declared = self.declared.iter().map(modality_entry::declared);
         ClipFormat {
             depth: self.depth,
             declared: declared.collect(),
             ..self.source.settings.format()
         }
+    }
+
+    /// What later stages do with declared modalities where they are not told otherwise.
+    pub(super) fn defaults(&self) -> Defaults {
+        modality_entry::defaults(&self.declared)
     }
 
     /// Bytes of one clip on disk.

@@ -4,6 +4,7 @@ use super::settings::{ClipsSettings, MARKERS};
 use crate::experiment::context::{StageContext, StageError};
 use crate::experiment::problem::Code;
 use crate::modality::ClipFormat;
+use crate::source::coded::Coded;
 use crate::source::open::open;
 use crate::source::split::{Chosen, divide};
 use crate::source::world::World;
@@ -27,7 +28,7 @@ pub(super) fn parts(
         let part = |(split, first, count): (&'static str, u64, u64)| {
             let clips = WorldClips::new(world.clone(), first..first + count);
             let source: Arc<dyn Source> = Arc::new(clips.with_declared(&format.declared));
-            (split, source)
+            (split, Coded::wrap(source, format))
         };
         return Ok(settings.splits().map(part).collect());
     };
@@ -71,7 +72,8 @@ pub(super) fn parts(
                 ),
             });
         }
-        parts.push((split, Arc::new(Chosen::new(Arc::clone(&source), clips))));
+        let chosen = Arc::new(Chosen::new(Arc::clone(&source), clips));
+        parts.push((split, Coded::wrap(chosen, format)));
     }
     Ok(parts)
 }

@@ -18,6 +18,7 @@ const METRICS: [(&str, &str); 6] = [
 
 pub(super) fn markdown(
     settings: &TrainTokenizerSettings,
+    tokenizer: &str,
     tokens: &TokenFacts,
     parameters: usize,
     shape: &Shape,
@@ -26,7 +27,7 @@ pub(super) fn markdown(
     let mut page = format!(
         "## Tokenizer of `{}`\n\n`{}`: {:?} tokens of {}, {parameters} parameters, {} steps of {} signals.\n\n",
         settings.modality,
-        settings.tokenizer.name,
+        tokenizer,
         tokens.grid,
         tokens.vocabulary,
         settings.steps,

@@ -1,6 +1,7 @@
 //! Running `op: train_tokenizer`: reading, the loop, what leaves.
 
 use super::super::clip_signals::{damaged, extract, format, modality, open_split};
+use super::super::modality_entry::DEFAULTS;
 use super::super::tokenizer_entry::TokenizerEntry;
 use super::picture::{self, Example};
 use super::scores::{Baselines, Scores, score};
@@ -60,6 +61,9 @@ pub(super) fn run(
             settings.modality
         ))
     })?;
+    let entry = settings
+        .entry(clips.contents.get(DEFAULTS))
+        .ok_or_else(|| damaged("no tokenizer is named"))?;
     let data = Data {
         train: open_split(&clips.path, "train")?
             .ok_or_else(|| damaged("the clips have no `train` split"))?,
@@ -67,7 +71,7 @@ pub(super) fn run(
         format,
         modality,
     };
-    let (scores, examples, count) = match &settings.tokenizer.settings {
+    let (scores, examples, count) = match &entry.settings {
         TokenizerEntry::Vq(sizes) => train_vq(settings, sizes, &data, context)?,
         TokenizerEntry::Video(sizes) => train_video(settings, sizes, &data, context)?,
     };
@@ -75,9 +79,16 @@ pub(super) fn run(
     let path = context.output().join("scores.json");
     let text = format!("{:#}\n", json!(scores));
     std::fs::write(&path, text).map_err(StageError::io(&path))?;
-    let facts = tokens(&settings.tokenizer.settings, &data.modality.shape())
-        .map_err(|reason| damaged(&reason))?;
-    let page = report::markdown(settings, &facts, count, &data.modality.shape(), &scores);
+    let facts =
+        tokens(&entry.settings, &data.modality.shape()).map_err(|reason| damaged(&reason))?;
+    let page = report::markdown(
+        settings,
+        &entry.name,
+        &facts,
+        count,
+        &data.modality.shape(),
+        &scores,
+    );
     super::super::evaluate::write_text(context.output(), "report/tokenizer.md", &page)?;
     if let Some((name, bytes)) = picture::draw(&data.modality.shape(), &examples) {
         let path = context.output().join("report").join(name);
@@ -85,7 +96,7 @@ pub(super) fn run(
     }
     Ok(json!({
         "modality": settings.modality,
-        "tokenizer": settings.tokenizer.name,
+        "tokenizer": entry.name,
         "tokens": {(settings.modality.clone()): facts},
         "parameters": count,
         "steps": settings.steps,

@@ -60,12 +60,10 @@ fn head_imu() -> DeclaredSettings {
             missing: Missing::Nan,
         },
         normalize: Normalize::Standard,
-        tokenizer: None,
         source: SignalSource {
             world: Some(SENSORS[0].to_owned()),
             ..SignalSource::default()
         },
-        metrics: Vec::new(),
     }
 }
 

@@ -1,0 +1,249 @@
+//! Modalities that `src/` does not know, from clips to a row of a table: one declared in YAML, one computed by a plug-in crate.
+
+use reviv::evaluation::table::{RowKind, Table};
+use reviv::experiment::catalog::Catalog;
+use reviv::experiment::load::{Request, load};
+use reviv::run::execute::{Job, cache_of, execute};
+use reviv::run::{Interrupt, Progress, State};
+use serde_json::Value;
+use std::path::{Path, PathBuf};
+
+// The example crate's own file: this test program links it in as the crate's binary does.
+#[path = "../../examples/plugin_modality/src/head_turn.rs"]
+mod head_turn;
+
+const EXPERIMENT: &str = "
+experiment: plugins
+about: Two modalities that are not built in, and one that is.
+stages:
+  clips:
+    op: clips
+    source: {use: world_small, world: {size: 16, rooms: 3}}
+    train: 12
+    validation: 2
+    test: 4
+    declared: [head_imu, head_turn]
+  tok_imu: {op: train_tokenizer, clips: clips, modality: head_imu, steps: 3, batch: 4, warmup: 0, kmeans: false}
+  tok_turn:
+    op: train_tokenizer
+    clips: clips
+    modality: head_turn
+    tokenizer: {use: vq_temporal_small, codebook: 16, width: 16, depth: 1, heads: 2}
+    steps: 5
+    warmup: 0
+  tok_camera:
+    op: train_tokenizer
+    clips: clips
+    modality: camera
+    tokenizer: {use: vq_temporal_small, codebook: 16, width: 16, depth: 1, heads: 2}
+    steps: 3
+    warmup: 0
+  tokens: {op: tokenize, clips: clips, tokenizers: [tok_imu, tok_turn, tok_camera]}
+  mget:
+    op: train_mget
+    tokens: tokens
+    size: {use: laptop_small, width: 24, heads: 2, encoder_depth: 1, decoder_depth: 1}
+    masking: {use: dirichlet_mixture, input_tokens: 30, target_tokens: 30}
+    steps: 3
+    batch: 4
+    warmup: {steps: 1}
+  predictions: {op: predict, model: mget, clips: clips, given: [camera]}
+  scores: {op: evaluate, predictions: predictions, clips: clips, suite: {use: world_camera, metrics: []}}
+  table: {op: table, scores: [scores]}
+";
+
+fn run(folder: &Path) -> PathBuf {
+    let file = folder.join("plugins.yaml");
+    std::fs::write(&file, EXPERIMENT).unwrap();
+    let request = Request {
+        path: file,
+        ..Request::default()
+    };
+    let (experiment, report) = load(&Catalog::linked(), &request);
+    let experiment = experiment.unwrap_or_else(|| panic!("{}", report.render(false)));
+    let runs = folder.join("runs");
+    let outcome = execute(&Job {
+        experiment: &experiment,
+        runs: &runs,
+        only: None,
+        shard: "1/1".parse().unwrap(),
+        progress: &Progress::silent(),
+        interrupt: &Interrupt::default(),
+        crew: Crew::alone(),
+    })
+    .unwrap();
+    let failures: Vec<String> = outcome.failures.iter().map(ToString::to_string).collect();
+    assert_eq!(outcome.state, State::Done, "{failures:?}");
+    runs
+}
+
+/// What a stage of this op (and modality) left, with its manifest's contents.
+fn made(runs: &Path, op: &str, modality: &str) -> (PathBuf, Value) {
+    let entries = cache_of(runs).entries().unwrap();
+    let found = entries.into_iter().find_map(|leaf| {
+        let text = std::fs::read_to_string(leaf.path.join("manifest.json")).ok()?;
+        let manifest: Value = serde_json::from_str(&text).ok()?;
+        let contents = manifest["contents"].clone();
+        let named = contents["modality"].as_str().unwrap_or_default() == modality;
+        (manifest["recipe"]["op"] == op && named).then_some((leaf.path, contents))
+    });
+    found.unwrap_or_else(|| panic!("no {op} of {modality}"))
+}
+
+#[test]
+fn declared_and_coded_modalities_reach_the_table_beside_their_baseline() {
+    let folder = tempfile::tempdir().unwrap();
+    let runs = run(folder.path());
+    // The entry's own tokenizer, as no stage names one.
+    let (_, tokenizer) = made(&runs, "train_tokenizer", "head_imu");
+    assert_eq!(tokenizer["tokenizer"], "vq_temporal_small");
+    assert_eq!(tokenizer["tokens"]["head_imu"]["vocabulary"], 512);
+    let (_, tokenizer) = made(&runs, "train_tokenizer", "head_turn");
+    assert_eq!(tokenizer["tokens"]["head_turn"]["vocabulary"], 16);
+    // The entries' own metrics, as the suite names none.
+    let (path, _) = made(&runs, "table", "");
+    let text = std::fs::read_to_string(path.join("table.json")).unwrap();
+    let table: Table = serde_json::from_str(&text).unwrap();
+    let columns: Vec<&str> = table.columns.iter().map(|c| c.name.as_str()).collect();
+    assert_eq!(columns, ["head_imu.rmse", "head_turn.rmse"]);
+    let row = |label: &str, kind: RowKind| {
+        let found = table
+            .rows
+            .iter()
+            .find(|r| r.label == label && r.kind == kind);
+        found.unwrap_or_else(|| panic!("no row `{label}`: {:?}", table.rows))
+    };
+    let own = row("reviv", RowKind::System);
+    let mean = row("mean value", RowKind::Baseline);
+    let floor = row("tokenizer floor", RowKind::Baseline);
+    for ((own, mean), floor) in own.cells.iter().zip(&mean.cells).zip(&floor.cells) {
+        assert_eq!((own.n, mean.n, floor.n), (4, 4, 4));
+        for cell in [own, mean, floor] {
+            assert!(cell.value.unwrap() > 0.0);
+        }
+    }
+    let page = std::fs::read_to_string(path.join("report/table.md")).unwrap();
+    assert!(path.join("report/table_intervals.svg").is_file());
+    assert!(
+        page.contains("head_imu.rmse") && page.contains("mean value"),
+        "{page}"
+    );
+    the_clock_is_in_the_record_alone(&runs);
+}
+
+/// Seconds per clip and part, and none of them in an artifact.
+fn the_clock_is_in_the_record_alone(runs: &Path) {
+    let record = std::fs::read_dir(runs)
+        .unwrap()
+        .map(|entry| {
+            entry
+                .unwrap()
+                .path()
+                .join("stages/predictions/metrics.jsonl")
+        })
+        .find(|path| path.is_file())
+        .unwrap();
+    let record = std::fs::read_to_string(record).unwrap();
+    for part in ["read", "encode", "generate", "detokenize"] {
+        assert!(
+            record.contains(&format!("seconds_per_clip/{part}")),
+            "{record}"
+        );
+    }
+    let (path, _) = made(runs, "predict", "");
+    let text = std::fs::read_to_string(path.join("manifest.json")).unwrap();
+    assert!(!text.contains("seconds_per_clip"));
+}
+
+#[test]
+fn the_experiment_of_the_example_crate_checks() {
+    let path = concat!(
+        env!("CARGO_MANIFEST_DIR"),
+        "/examples/plugin_modality/head_turn.yaml"
+    );
+    let request = Request {
+        path: path.into(),
+        ..Request::default()
+    };
+    let (experiment, report) = load(&Catalog::linked(), &request);
+    assert!(!report.failed(), "{}", report.render(false));
+    let stages = &experiment.unwrap().cells[0].graph;
+    let scores = stages.find("scores").unwrap();
+    assert_eq!(scores.description.columns, ["head_turn.rmse"]);
+}
+
+#[test]
+fn code_that_is_not_linked_in_is_named_where_it_is_written() {
+    let output = std::process::Command::new(env!("CARGO_BIN_EXE_reviv"))
+        .args(["check", "--json"])
+        .arg(concat!(
+            env!("CARGO_MANIFEST_DIR"),
+            "/examples/plugin_modality/src/head_turn.yaml"
+        ))
+        .output()
+        .unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    assert!(output.status.success(), "the entry itself is sound");
+    let entry = include_str!("../../examples/plugin_modality/src/head_turn.yaml");
+    let entries = folder.path().join("registry/modality");
+    std::fs::create_dir_all(&entries).unwrap();
+    std::fs::write(entries.join("head_turn.yaml"), entry).unwrap();
+    let file = folder.path().join("a.yaml");
+    let text = "experiment: a\nstages: {clips: {op: clips, source: world_small, train: 1, declared: [head_turn]}}\n";
+    std::fs::write(&file, text).unwrap();
+    let output = std::process::Command::new(env!("CARGO_BIN_EXE_reviv"))
+        .arg("check")
+        .arg(&file)
+        .output()
+        .unwrap();
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert_eq!(output.status.code(), Some(1), "{said}");
+    assert!(said.contains("no code `head_turn` is linked"), "{said}");
+}
+
+#[test]
+fn the_skeleton_of_a_modality_checks_and_overwrites_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let reviv = |arguments: &[&str]| {
+        let output = std::process::Command::new(env!("CARGO_BIN_EXE_reviv"))
+            .args(arguments)
+            .current_dir(folder.path())
+            .output()
+            .unwrap();
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        (
+            output.status.code(),
+            String::from_utf8(output.stdout).unwrap(),
+            said,
+        )
+    };
+    let (code, path, said) = reviv(&["new", "modality", "heart_rate"]);
+    assert_eq!(
+        (code, path.trim()),
+        (Some(0), "registry/modality/heart_rate.yaml"),
+        "{said}"
+    );
+    let (code, _, said) = reviv(&["check", path.trim()]);
+    assert_eq!(code, Some(0), "{said}");
+    let text = std::fs::read_to_string(folder.path().join(path.trim())).unwrap();
+    std::fs::write(
+        folder.path().join(path.trim()),
+        text.replace("sentence", "word"),
+    )
+    .unwrap();
+    let (code, _, said) = reviv(&["new", "modality", "heart_rate"]);
+    assert_eq!(code, Some(1));
+    assert!(said.contains("is there already"), "{said}");
+    let kept = std::fs::read_to_string(folder.path().join(path.trim())).unwrap();
+    assert!(kept.contains("What it measures, in a word."));
+    for (name, reason) in [
+        ("camera", "there is a modality"),
+        ("head_imu", "there is a modality"),
+        ("../up", "cannot name"),
+        ("a.b", "cannot name"),
+    ] {
+        let (code, _, said) = reviv(&["new", "modality", name]);
+        assert_eq!(code, Some(1), "{name}");
+        assert!(said.contains(reason), "{said}");
+    }
+}
