@@ -4,7 +4,7 @@ use reviv::evaluation::table::{RowKind, Table};
 use reviv::experiment::catalog::Catalog;
 use reviv::experiment::load::{Request, load};
 use reviv::run::execute::{Job, cache_of, execute};
-use reviv::run::{Interrupt, Progress, State};
+use reviv::run::{Crew, Interrupt, Progress, State};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 
