@@ -4,6 +4,11 @@
 //! (`tokenizers/<modality>/`), and [`FILE`], which says what clips it takes and names the tokenizers by their bytes, so that a
 //! model and tokenizers that do not belong together are found before anything is decoded into nonsense.
 
+mod binding;
+
+pub use binding::Binding;
+
+use self::binding::{digest, not_a_model};
 use super::{
     DecodingError, DecodingSettings, Generated, GeneratedTokens, MgetTokens, Sample, Slot, generate,
 };
@@ -14,7 +19,6 @@ use crate::mget::{Content, Mget, ModalitySpec};
 use crate::modality::{self, ClipFormat, Modality};
 use crate::tokenizer::{self, TokenGrid, Tokenizer, TokenizerError};
 use rand::RngExt;
-use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -22,16 +26,6 @@ use std::path::{Path, PathBuf};
 pub const FILE: &str = "model.json";
 /// The folder of tokenizers in a model folder.
 pub const TOKENIZERS: &str = "tokenizers";
-
-/// What [`FILE`] holds.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct Binding {
-    /// The sizes of the clips the model was trained on.
-    pub clips: ClipFormat,
-    /// blake3 of the files of every tokenizer, by modality.
-    pub tokenizers: BTreeMap<String, String>,
-}
 
 /// Why a model folder cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -72,90 +66,6 @@ pub enum ReconstructorError {
     Tokenizer(#[from] TokenizerError),
     #[error(transparent)]
     Decoding(#[from] DecodingError),
-}
-
-impl Binding {
-    /// Binds the tokenizers that lie in `folder` to the clips that their model was trained on.
-    ///
-    /// # Errors
-    /// When a file cannot be read.
-    pub fn of(folder: &Path, clips: ClipFormat) -> Result<Self, ReconstructorError> {
-        let root = folder.join(TOKENIZERS);
-        let mut tokenizers = BTreeMap::new();
-        for path in entries(&root)? {
-            if let Some(name) = path.file_name().and_then(|name| name.to_str())
-                && path.is_dir()
-            {
-                tokenizers.insert(name.to_owned(), digest(&path)?);
-            }
-        }
-        Ok(Self { clips, tokenizers })
-    }
-
-    /// Writes [`FILE`] into `folder`.
-    ///
-    /// # Errors
-    /// When it cannot be written.
-    pub fn write(&self, folder: &Path) -> Result<(), ReconstructorError> {
-        let path = folder.join(FILE);
-        let text =
-            serde_json::to_string_pretty(self).map_err(|error| not_a_model(folder, error))?;
-        std::fs::write(&path, text + "\n").map_err(|error| ReconstructorError::Io { path, error })
-    }
-
-    /// Reads [`FILE`] of `folder`.
-    ///
-    /// # Errors
-    /// When it is not there or not of this form.
-    pub fn read(folder: &Path) -> Result<Self, ReconstructorError> {
-        let text = std::fs::read_to_string(folder.join(FILE))
-            .map_err(|error| not_a_model(folder, format_args!("`{FILE}`: {error}")))?;
-        serde_json::from_str(&text)
-            .map_err(|error| not_a_model(folder, format_args!("`{FILE}`: {error}")))
-    }
-}
-
-fn not_a_model(path: &Path, reason: impl std::fmt::Display) -> ReconstructorError {
-    ReconstructorError::NotAModel {
-        path: path.to_owned(),
-        reason: reason.to_string(),
-    }
-}
-
-/// What lies in a folder, by name; nothing where there is no folder.
-fn entries(folder: &Path) -> Result<Vec<PathBuf>, ReconstructorError> {
-    let wrong = |error| ReconstructorError::Io {
-        path: folder.to_owned(),
-        error,
-    };
-    if !folder.is_dir() {
-        return Ok(Vec::new());
-    }
-    let mut paths = std::fs::read_dir(folder)
-        .map_err(wrong)?
-        .map(|entry| Ok(entry?.path()))
-        .collect::<Result<Vec<_>, std::io::Error>>()
-        .map_err(wrong)?;
-    paths.sort();
-    Ok(paths)
-}
-
-/// The hash of names and bytes of the files of a folder.
-fn digest(folder: &Path) -> Result<String, ReconstructorError> {
-    let mut hasher = blake3::Hasher::new();
-    for path in entries(folder)?.into_iter().filter(|path| path.is_file()) {
-        let name = path.file_name().unwrap_or_default().to_string_lossy();
-        hasher.update(&(name.len() as u64).to_le_bytes());
-        hasher.update(name.as_bytes());
-        let wrong = |error| ReconstructorError::Io {
-            path: path.clone(),
-            error,
-        };
-        let file = std::fs::File::open(&path).map_err(wrong)?;
-        hasher.update(&file.metadata().map_err(wrong)?.len().to_le_bytes());
-        hasher.update_reader(file).map_err(wrong)?;
-    }
-    Ok(hasher.finalize().to_hex()[..32].to_owned())
 }
 
 /// A model with its tokenizers.
