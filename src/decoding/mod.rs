@@ -13,7 +13,7 @@ pub mod reconstructor;
 pub mod schedule;
 pub mod settings;
 
-pub use generate::{Generated, GeneratedTokens, generate};
+pub use generate::{Generated, GeneratedTokens, generate, generate_rounds};
 pub use mget::MgetTokens;
 pub use model::{DecodingError, Sample, Slot, TokenModality, TokenModel};
 pub use reconstructor::{Reconstructed, Reconstructor, ReconstructorError, Wish};

@@ -10,7 +10,8 @@ pub use binding::Binding;
 
 use self::binding::{digest, not_a_model};
 use super::{
-    DecodingError, DecodingSettings, Generated, GeneratedTokens, MgetTokens, Sample, Slot, generate,
+    DecodingError, DecodingSettings, Generated, GeneratedTokens, MgetTokens, Sample, Slot,
+    generate_rounds,
 };
 use crate::clip::{Clip, Signal};
 use crate::engine::Compute;
@@ -224,13 +225,16 @@ impl Reconstructor {
             .collect();
         let targets: Vec<&str> = wish.wanted.iter().map(String::as_str).collect();
         let model = MgetTokens::new(&self.model);
-        let rounds = (0..wish.decoding.samples.max(1))
-            .map(|round| {
-                let seed = seed_of_round(wish.seed, round);
-                generate(&model, wish.decoding, &samples, &targets, seed)
-            })
-            .collect::<Result<Vec<_>, _>>()?;
-        Ok(rounds)
+        let seeds: Vec<u64> = (0..wish.decoding.samples.max(1))
+            .map(|round| seed_of_round(wish.seed, round))
+            .collect();
+        Ok(generate_rounds(
+            &model,
+            wish.decoding,
+            &samples,
+            &targets,
+            &seeds,
+        )?)
     }
 
     /// Turns generated tokens of `clips` into signals; the end of [`Reconstructor::reconstruct`].
