@@ -240,7 +240,7 @@ impl<M: TokenModel> Run<'_, M> {
     }
 
     /// Answers from what was given alone.
-    fn from_given(
+    fn answers_to_given(
         &mut self,
         samples: &[Sample<'_>],
         asked: &Asked,
@@ -279,7 +279,7 @@ impl<M: TokenModel> Run<'_, M> {
 
         let nothing_hidden = vec![false; group.hidden.len()];
         let conditional = if state.untouched {
-            self.from_given(&state.samples, &asked, &nothing_hidden)?
+            self.answers_to_given(&state.samples, &asked, &nothing_hidden)?
         } else {
             let context = self.model.encode(&state.samples, &nothing_hidden)?;
             Rc::new(self.model.decode(&context, &asked)?)
