@@ -80,7 +80,8 @@ pub struct Reconstructor {
 /// What to generate, and how.
 #[derive(Debug, Clone)]
 pub struct Wish<'a> {
-    /// Modalities that every clip has and the model sees.
+    /// Modalities that every clip has and the model sees; `rgb` gives raw video too where the model takes it, `pixels` raw video
+    /// alone.
     pub given: &'a [String],
     /// Modalities to generate.
     pub wanted: &'a [String],
@@ -182,10 +183,14 @@ impl Reconstructor {
     pub fn modality(&self, name: &str) -> Result<&dyn Modality, ReconstructorError> {
         match self.modalities.get(name) {
             Some(modality) if self.tokenizers.contains_key(name) => Ok(modality.as_ref()),
-            _ => Err(ReconstructorError::UnknownModality {
-                name: name.to_owned(),
-                known: self.names().collect::<Vec<_>>().join(", "),
-            }),
+            _ => Err(self.unknown(name)),
+        }
+    }
+
+    fn unknown(&self, name: &str) -> ReconstructorError {
+        ReconstructorError::UnknownModality {
+            name: name.to_owned(),
+            known: self.names().collect::<Vec<_>>().join(", "),
         }
     }
 
@@ -329,11 +334,19 @@ impl Reconstructor {
     ) -> Result<Seen<'a>, ReconstructorError> {
         let mut seen = Seen::default();
         for name in given {
-            let signals = self.signals(name, clips)?;
-            if name == "rgb" && self.model.spec().index(PIXELS).is_some() {
+            let takes_pixels = self.model.spec().index(PIXELS).is_some();
+            if takes_pixels && (name == PIXELS || name == "rgb") {
+                let rgb = self
+                    .modalities
+                    .get("rgb")
+                    .ok_or_else(|| self.unknown(name))?;
                 let floats = |signal: &Signal| signal.values.iter().copied().collect();
-                seen.pixels = signals.iter().map(floats).collect();
+                seen.pixels = signals(rgb.as_ref(), clips)?.iter().map(floats).collect();
             }
+            if takes_pixels && name == PIXELS {
+                continue;
+            }
+            let signals = signals(self.modality(name)?, clips)?;
             seen.tokens
                 .insert(name, self.tokenizers[name].encode(&signals)?);
         }
@@ -352,20 +365,19 @@ impl Reconstructor {
         };
         self.model.spec().modalities.iter().map(of).collect()
     }
+}
 
-    fn signals(&self, name: &str, clips: &[Clip]) -> Result<Vec<Signal>, ReconstructorError> {
-        let modality = self.modality(name)?;
-        let of = |clip: &Clip| {
-            let signal = modality
-                .extract(clip)
-                .map_err(|error| wrong_clip(clip, error))?;
-            signal.ok_or_else(|| ReconstructorError::NotGiven {
-                clip: clip.id.clone(),
-                modality: name.to_owned(),
-            })
-        };
-        clips.iter().map(of).collect()
-    }
+fn signals(modality: &dyn Modality, clips: &[Clip]) -> Result<Vec<Signal>, ReconstructorError> {
+    let of = |clip: &Clip| {
+        let signal = modality
+            .extract(clip)
+            .map_err(|error| wrong_clip(clip, error))?;
+        signal.ok_or_else(|| ReconstructorError::NotGiven {
+            clip: clip.id.clone(),
+            modality: modality.name().to_owned(),
+        })
+    };
+    clips.iter().map(of).collect()
 }
 
 fn wrong_clip(clip: &Clip, reason: impl std::fmt::Display) -> ReconstructorError {

@@ -29,7 +29,8 @@ const BATCH: usize = 8;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct PredictSettings {
-    /// Modalities the model is given; raw video is given whenever the model takes it and `rgb` is.
+    /// Modalities the model is given: `rgb` is the video's tokens, and raw video where the model takes it; `pixels` is raw video
+    /// alone.
     pub given: Vec<String>,
     /// Modalities it generates; empty means all others.
     pub wanted: Vec<String>,
@@ -64,6 +65,11 @@ impl Default for PredictSettings {
 #[derive(Debug)]
 pub struct Predict;
 inventory::submit! { OpEntry(&Predict) }
+
+/// The signal of a clip that a modality of a model is made of.
+fn signal_of(name: &str) -> &str {
+    if name == PIXELS { "rgb" } else { name }
+}
 
 impl PredictSettings {
     /// The modalities to generate, of those the model knows.
@@ -137,11 +143,12 @@ impl Op for Predict {
             }
         }
         for (index, name) in settings.given.iter().enumerate() {
-            if !clips.signals.is_empty() && !clips.signals.contains_key(name) {
+            let signal = signal_of(name);
+            if !clips.signals.is_empty() && !clips.signals.contains_key(signal) {
                 problems.push(Problem::new(
                     Code::E0203,
                     format!("given.{index}"),
-                    format!("the clips have no `{name}`"),
+                    format!("the clips have no `{signal}`"),
                 ));
             }
         }
@@ -224,7 +231,7 @@ impl Op for Predict {
         if settings.floor {
             floor = Some(create(&context.output().join(FLOOR), "tokenizer floor")?);
         }
-        let mut read: Vec<&str> = settings.given.iter().map(String::as_str).collect();
+        let mut read: Vec<&str> = settings.given.iter().map(|name| signal_of(name)).collect();
         if settings.floor {
             read.extend(targets.iter().map(String::as_str));
         }

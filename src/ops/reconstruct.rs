@@ -12,6 +12,7 @@ use crate::experiment::{
     Arity, ArtifactKind, Code, Description, Entry, FileInput, FilePath, Inputs, Op, OpEntry, Port,
     Problem, StageContext, StageError, StagePlan,
 };
+use crate::masking::PIXELS;
 use crate::reconstruction::lens::LensSettings;
 use crate::reconstruction::scale::FloorFit;
 use crate::reconstruction::windows::windows;
@@ -41,6 +42,8 @@ pub struct ReconstructSettings {
     pub clip: usize,
     /// A model folder that no stage makes.
     pub model_folder: Option<FilePath>,
+    /// What of the video the model is given: `rgb` is its tokens, and raw video where the model takes it; `pixels` is raw video alone.
+    pub given: Vec<String>,
     /// What is generated; empty means everything but `rgb`.
     pub wanted: Vec<String>,
     /// How tokens are generated.
@@ -66,6 +69,7 @@ impl Default for ReconstructSettings {
             split: "test".to_owned(),
             clip: 0,
             model_folder: None,
+            given: vec!["rgb".to_owned()],
             wanted: Vec::new(),
             decoding: Entry {
                 name: "fast".to_owned(),
@@ -92,7 +96,7 @@ impl Op for Reconstruct {
     }
 
     fn version(&self) -> u32 {
-        1
+        2
     }
 
     fn about(&self) -> &'static str {
@@ -195,6 +199,15 @@ impl Op for Reconstruct {
                         .help(format!("it has: {}", known.join(", "))),
                     );
                 }
+            }
+        }
+        for (index, name) in settings.given.iter().enumerate() {
+            if name != "rgb" && name != PIXELS {
+                let message = format!("a video has no `{name}`");
+                problems.push(
+                    Problem::new(Code::E0203, format!("given.{index}"), message)
+                        .help("it has `rgb` and `pixels`"),
+                );
             }
         }
         if let Err(error) = windows(1.0, settings.overlap) {

@@ -62,7 +62,6 @@ pub(super) fn run(
         })
         .map_err(refused)?;
     let format = reconstructor.format().clone();
-    let given = ["rgb".to_owned()];
     let wanted: Vec<String> = if settings.wanted.is_empty() {
         let others = reconstructor.names().filter(|name| *name != "rgb");
         others.map(ToOwned::to_owned).collect()
@@ -109,7 +108,7 @@ pub(super) fn run(
     let mut folder =
         Folder::new(&context.output().join(FOLDER), setting).map_err(StageError::other)?;
     let wish = Wish {
-        given: &given,
+        given: &settings.given,
         wanted: &wanted,
         decoding: &settings.decoding.settings,
         seed: context.seed(),
