@@ -13,6 +13,7 @@ use crate::experiment::{
     Problem, StageContext, StageError, StagePlan,
 };
 use crate::masking::PIXELS;
+use crate::mget::MgetSpec;
 use crate::reconstruction::predictions::{FLOOR, PredictionsWriter, ScaleStatus, SignalNote};
 use crate::run::environment::Stopwatch;
 use schemars::JsonSchema;
@@ -69,6 +70,13 @@ inventory::submit! { OpEntry(&Predict) }
 /// The signal of a clip that a modality of a model is made of.
 fn signal_of(name: &str) -> &str {
     if name == PIXELS { "rgb" } else { name }
+}
+
+/// Whether a model takes raw video.
+pub(super) fn takes_pixels(model: &Description) -> bool {
+    let spec = model.extra.get("mget").cloned();
+    spec.and_then(|spec| serde_json::from_value::<MgetSpec>(spec).ok())
+        .is_some_and(|spec| spec.index(PIXELS).is_some())
 }
 
 impl PredictSettings {
@@ -130,7 +138,8 @@ impl Op for Predict {
         let known: Vec<&str> = model.tokens.keys().map(String::as_str).collect();
         for (key, names) in [("given", &settings.given), ("wanted", &settings.wanted)] {
             for (index, name) in names.iter().enumerate() {
-                if !known.contains(&name.as_str()) {
+                let video = key == "given" && name == PIXELS && takes_pixels(model);
+                if !video && !known.contains(&name.as_str()) {
                     problems.push(
                         Problem::new(
                             Code::E0203,

@@ -6,7 +6,7 @@
 mod recording;
 mod run;
 
-use super::predict::artifact;
+use super::predict::{artifact, takes_pixels};
 use crate::decoding::DecodingSettings;
 use crate::experiment::{
     Arity, ArtifactKind, Code, Description, Entry, FileInput, FilePath, Inputs, Op, OpEntry, Port,
@@ -202,12 +202,19 @@ impl Op for Reconstruct {
             }
         }
         for (index, name) in settings.given.iter().enumerate() {
-            if name != "rgb" && name != PIXELS {
-                let message = format!("a video has no `{name}`");
-                problems.push(
-                    Problem::new(Code::E0203, format!("given.{index}"), message)
-                        .help("it has `rgb` and `pixels`"),
-                );
+            let wrong = if name != "rgb" && name != PIXELS {
+                Some((
+                    format!("a video has no `{name}`"),
+                    "it has `rgb` and `pixels`",
+                ))
+            } else if name == PIXELS && model.is_some_and(|model| !takes_pixels(model)) {
+                Some(("the model takes no raw video".to_owned(), "give it `rgb`"))
+            } else {
+                None
+            };
+            if let Some((message, help)) = wrong {
+                problems
+                    .push(Problem::new(Code::E0203, format!("given.{index}"), message).help(help));
             }
         }
         if let Err(error) = windows(1.0, settings.overlap) {
