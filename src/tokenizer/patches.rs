@@ -135,7 +135,7 @@ impl Patches {
     }
 
     /// Where each value of a signal goes: the position in its patches of element `i` of the signal.
-    fn positions(&self) -> impl Iterator<Item = usize> + '_ {
+    pub(super) fn positions(&self) -> impl Iterator<Item = usize> + '_ {
         let [time, joints] = self.patch;
         let columns = self.joints / joints;
         (0..self.samples).flat_map(move |t| {

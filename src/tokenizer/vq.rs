@@ -4,7 +4,7 @@
 //! patches are cut and in the position table. Suffixes: `N` tokens of all samples, `P` values of a patch, `D` width, `L` code
 //! width.
 
-use burn::tensor::{Tensor, TensorData};
+use burn::tensor::{Int, Tensor, TensorData};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -49,6 +49,9 @@ pub struct VqSettings {
     pub mlp_ratio: usize,
     /// What is minimised.
     pub loss: Loss,
+    /// Weight of the errors of steps from sample to sample beside the errors of samples. Small tokenizers jump where a token ends;
+    /// this smooths them. 0: none, as in the paper.
+    pub velocity: f64,
     /// Decay of the running means of codes and counts.
     pub ema_decay: f64,
     /// Codes with a smaller running count are replaced by latents of the batch.
@@ -71,6 +74,7 @@ impl Default for VqSettings {
             heads: 12,
             mlp_ratio: 4,
             loss: Loss::MaskedMse,
+            velocity: 0.0,
             ema_decay: 0.99,
             dead_below: 2.0,
             commitment: 1.0,
@@ -106,9 +110,14 @@ impl VqSettings {
         if self.codebook == 0 || self.code_width == 0 || self.depth == 0 || self.mlp_ratio == 0 {
             return wrong("codebook, code_width, depth and mlp_ratio are at least 1".to_owned());
         }
-        if !(0.0..1.0).contains(&self.ema_decay) || self.dead_below < 0.0 || self.commitment < 0.0 {
+        if !(0.0..1.0).contains(&self.ema_decay)
+            || self.dead_below < 0.0
+            || self.commitment < 0.0
+            || self.velocity < 0.0
+        {
             return wrong(
-                "ema_decay lies in [0, 1), dead_below and commitment are not negative".to_owned(),
+                "ema_decay lies in [0, 1), dead_below, commitment and velocity are not negative"
+                    .to_owned(),
             );
         }
         Patches::new(shape, &self.compression)
@@ -418,16 +427,55 @@ impl VqVae {
     /// The reconstruction loss of patches, `[1]`.
     #[must_use]
     pub fn loss(&self, found_NP: Tensor<2>, batch: &Batch) -> Tensor<1> {
-        let square_NP = (found_NP - batch.values_NP.clone()).square();
-        match self.settings.loss {
-            Loss::Mse => square_NP.mean(),
-            Loss::MaskedMse => {
-                let square_NP = match &batch.valid_NP {
-                    Some(valid_NP) => square_NP * valid_NP.clone(),
-                    None => square_NP,
-                };
-                square_NP.sum() / batch.valid.max(1.0)
+        let error_NP = found_NP - batch.values_NP.clone();
+        let square_NP = error_NP.clone().square();
+        let square_NP = match (&batch.valid_NP, self.settings.loss) {
+            (Some(valid_NP), Loss::MaskedMse) => square_NP * valid_NP.clone(),
+            _ => square_NP,
+        };
+        let loss = self.total(square_NP, batch);
+        if self.settings.velocity == 0.0 {
+            return loss;
+        }
+        loss + self.velocity(error_NP, batch) * self.settings.velocity
+    }
+
+    /// The penalty of the errors of steps from each sample to the next; both have to be valid.
+    fn velocity(&self, error_NP: Tensor<2>, batch: &Batch) -> Tensor<1> {
+        let [tokens, width] = error_NP.dims();
+        let (values, each) = (
+            tokens * width / batch.samples,
+            self.patches.values_per_sample(),
+        );
+        let order: Vec<i64> = self.patches.positions().map(|place| place as i64).collect();
+        let order =
+            Tensor::<1, Int>::from_data(TensorData::new(order, [values]), &error_NP.device());
+        let over_time = |x_NP: Tensor<2>| {
+            x_NP.reshape([batch.samples, values])
+                .select(1, order.clone())
+        };
+        let both = |x: Tensor<2>| {
+            (
+                x.clone().narrow(1, each, values - each),
+                x.narrow(1, 0, values - each),
+            )
+        };
+        let (next, this) = both(over_time(error_NP));
+        let step = (next - this).square();
+        match &batch.valid_NP {
+            Some(valid_NP) => {
+                let (next, this) = both(over_time(valid_NP.clone()));
+                self.total(step * next * this, batch)
             }
+            None => self.total(step, batch),
+        }
+    }
+
+    /// Masked squares over as much as the loss is over.
+    fn total(&self, square: Tensor<2>, batch: &Batch) -> Tensor<1> {
+        match self.settings.loss {
+            Loss::Mse => square.mean(),
+            Loss::MaskedMse => square.sum() / batch.valid.max(1.0),
         }
     }
 
