@@ -156,7 +156,12 @@ fn theirs(python: &str) -> Option<([Time; 3], f64)> {
     Some(([time(a, b), time(c, d), time(e, f)], memory))
 }
 
+/// Inside the pool, as stages of a run are.
 fn main() {
+    rayon::join(bench, || ());
+}
+
+fn bench() {
     let mut arguments = std::env::args().skip(1);
     let mut python = None;
     while let Some(argument) = arguments.next() {

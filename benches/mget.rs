@@ -226,12 +226,16 @@ fn main() {
         let named = |a: &&String| ["tiny", "base", "packing"].contains(&a.as_str());
         arguments.iter().all(|a| !named(&a)) || arguments.iter().any(|a| a == name)
     };
-    for case in CASES {
-        if wanted(case.0) {
-            compare(case, threads);
+    // Inside the pool, as stages of a run are.
+    let bench = || {
+        for case in CASES {
+            if wanted(case.0) {
+                compare(case, threads);
+            }
         }
-    }
-    if wanted("packing") {
-        packing();
-    }
+        if wanted("packing") {
+            packing();
+        }
+    };
+    rayon::join(bench, || ());
 }
