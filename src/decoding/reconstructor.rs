@@ -207,7 +207,7 @@ impl Reconstructor {
     ) -> Result<Vec<Reconstructed>, ReconstructorError> {
         let seen = self.see(clips, wish.given)?;
         let generated = self.generate(&seen, ids, wish)?;
-        self.decode(clips, &generated, wish.wanted)
+        self.decode(clips, &generated, wish)
     }
 
     /// Generates the tokens of what is wanted, once per sample that is averaged; the middle of [`Reconstructor::reconstruct`].
@@ -250,7 +250,7 @@ impl Reconstructor {
         &self,
         clips: &[Clip],
         rounds: &[Vec<Generated>],
-        wanted: &[String],
+        wish: &Wish<'_>,
     ) -> Result<Vec<Reconstructed>, ReconstructorError> {
         let mut made: Vec<Reconstructed> = clips
             .iter()
@@ -259,11 +259,11 @@ impl Reconstructor {
                 confidence: BTreeMap::new(),
             })
             .collect();
-        for name in wanted {
+        for name in wish.wanted {
             let modality = self.modality(name)?;
             let tokenizer = &self.tokenizers[name];
             let mut mean = Mean::default();
-            for generated in rounds {
+            for generated in rounds.iter().take(wish.decoding.samples_of(name)) {
                 let own: Vec<&GeneratedTokens> = generated
                     .iter()
                     .filter_map(|g| g.targets.get(name))

@@ -103,6 +103,10 @@ pub struct TargetChanges {
     pub top_k: Option<TopK>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub draw: Option<Draw>,
+    /// How many of the samples are decoded for the mean; fewer for video, whose decoding takes longest.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(range(min = 1))]
+    pub samples: Option<usize>,
 }
 
 /// How targets are generated from whatever is given.
@@ -142,6 +146,13 @@ impl Default for DecodingSettings {
 }
 
 impl DecodingSettings {
+    /// How many samples of one target are averaged.
+    #[must_use]
+    pub fn samples_of(&self, name: &str) -> usize {
+        let own = self.targets.get(name).and_then(|changes| changes.samples);
+        own.unwrap_or(self.samples).min(self.samples).max(1)
+    }
+
     /// The settings of one target.
     #[must_use]
     pub fn target(&self, name: &str) -> TargetSettings {

@@ -269,7 +269,7 @@ impl Op for Predict {
                 .map_err(refused)?;
             let made = times
                 .take("detokenize", count, || {
-                    reconstructor.decode(&batch, &tokens, &targets)
+                    reconstructor.decode(&batch, &tokens, &wish)
                 })
                 .map_err(refused)?;
             for one in made {
