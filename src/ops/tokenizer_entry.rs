@@ -64,8 +64,8 @@ mod tests {
             ("vq_gaze", temporal(2), 512, vec![30]),
             ("vq_hand", joints.clone(), 1024, vec![30, 7]),
             ("vq_body", joints.clone(), 2048, vec![30, 7]),
-            ("vq_temporal_small", temporal(6), 128, vec![30]),
-            ("vq_kinematic_small", joints, 256, vec![30, 7]),
+            ("vq_temporal_small", temporal(6), 256, vec![15]),
+            ("vq_kinematic_small", joints, 512, vec![15, 7]),
         ] {
             let TokenizerEntry::Vq(settings) = entry(name) else {
                 panic!("{name}");

@@ -4,135 +4,21 @@
 //! patches are cut and in the position table. Suffixes: `N` tokens of all samples, `P` values of a patch, `D` width, `L` code
 //! width.
 
+mod settings;
+
+pub use settings::{Loss, VqSettings};
+
 use burn::tensor::{Int, Tensor, TensorData};
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
 
 use super::TokenizerError;
 use super::patches::Patches;
-use super::quantizer::{Assignment, Quantizer, QuantizerSettings};
+use super::quantizer::{Assignment, Quantizer};
 use super::whitening::{Whitening, scale};
 use crate::engine::parameters::to_host;
 use crate::engine::{Initialise, Parameter, Parameters, Segments, ops, parameters};
 use crate::modality::Shape;
-use crate::nn::positions::{self, GridOrder};
+use crate::nn::positions;
 use crate::nn::{Block, LayerNorm, Linear, Mlp};
-
-/// What reconstruction is measured by while training; values are normalised.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "snake_case")]
-pub enum Loss {
-    /// Mean of squared errors over all values.
-    Mse,
-    /// Sum of squared errors of valid samples (or joints) divided by how many there are.
-    #[default]
-    MaskedMse,
-}
-
-/// The sizes of a VQ-VAE.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct VqSettings {
-    /// How many codes there are: the vocabulary.
-    pub codebook: usize,
-    /// Values per code.
-    pub code_width: usize,
-    /// Samples per token, and joints per token for joints: `[2]`, `[2, 3]`.
-    pub compression: Vec<usize>,
-    /// Width of the transformers.
-    pub width: usize,
-    /// Blocks of the encoder, and of the decoder.
-    pub depth: usize,
-    /// Attention heads; they divide the width.
-    pub heads: usize,
-    /// Width inside the MLPs, in widths.
-    pub mlp_ratio: usize,
-    /// What is minimised.
-    pub loss: Loss,
-    /// Weight of the errors of steps from sample to sample beside the errors of samples. Small tokenizers jump where a token ends;
-    /// this smooths them. 0: none, as in the paper.
-    pub velocity: f64,
-    /// Decay of the running means of codes and counts.
-    pub ema_decay: f64,
-    /// Codes with a smaller running count are replaced by latents of the batch.
-    pub dead_below: f64,
-    /// Weight of the loss that pulls latents to their codes.
-    pub commitment: f64,
-    /// How the position table of a grid of joints is enumerated.
-    pub positions: GridOrder,
-}
-
-impl Default for VqSettings {
-    /// The paper's sizes (ViT-B), for signals over time.
-    fn default() -> Self {
-        Self {
-            codebook: 512,
-            code_width: 32,
-            compression: vec![2],
-            width: 768,
-            depth: 12,
-            heads: 12,
-            mlp_ratio: 4,
-            loss: Loss::MaskedMse,
-            velocity: 0.0,
-            ema_decay: 0.99,
-            dead_below: 2.0,
-            commitment: 1.0,
-            positions: GridOrder::Released,
-        }
-    }
-}
-
-impl VqSettings {
-    /// How signals of `shape` are cut.
-    ///
-    /// # Errors
-    /// When a size is impossible.
-    pub fn patches(&self, shape: &Shape) -> Result<Patches, TokenizerError> {
-        let wrong = |what: String| Err(TokenizerError::Other(what));
-        let divisor = if matches!(shape, Shape::Kinematic { .. }) {
-            4
-        } else {
-            2
-        };
-        if self.width == 0 || !self.width.is_multiple_of(divisor) {
-            return wrong(format!(
-                "width {} is not a multiple of {divisor}, which the position table needs",
-                self.width
-            ));
-        }
-        if self.heads == 0 || !self.width.is_multiple_of(self.heads) {
-            return wrong(format!(
-                "{} heads do not divide width {}",
-                self.heads, self.width
-            ));
-        }
-        if self.codebook == 0 || self.code_width == 0 || self.depth == 0 || self.mlp_ratio == 0 {
-            return wrong("codebook, code_width, depth and mlp_ratio are at least 1".to_owned());
-        }
-        if !(0.0..1.0).contains(&self.ema_decay)
-            || self.dead_below < 0.0
-            || self.commitment < 0.0
-            || self.velocity < 0.0
-        {
-            return wrong(
-                "ema_decay lies in [0, 1), dead_below, commitment and velocity are not negative"
-                    .to_owned(),
-            );
-        }
-        Patches::new(shape, &self.compression)
-    }
-
-    fn quantizer(&self) -> QuantizerSettings {
-        QuantizerSettings {
-            codebook: self.codebook,
-            code_width: self.code_width,
-            decay: self.ema_decay,
-            dead_below: self.dead_below,
-            commitment: self.commitment,
-        }
-    }
-}
 
 /// What the ends of residual branches and the output are multiplied by before training.
 const QUIET: f32 = 0.1;

@@ -131,15 +131,15 @@ fn clips_become_tokens_that_the_model_reads_and_the_tokenizer_decodes() {
     let (_, tokens, contents) = of("tokenize");
     assert_eq!(
         contents["tokens"]["camera"]["grid"],
-        serde_json::json!([30])
+        serde_json::json!([15])
     );
     assert_eq!(contents["pixels"], serde_json::json!([16, 16, 16, 3]));
     let spec = MgetSpec {
         size: Size::default(),
         positions: Positions::Released,
         modalities: vec![
-            ModalitySpec::tokens("camera", &[30], 16),
-            ModalitySpec::tokens("left_hand", &[30, 7], 16),
+            ModalitySpec::tokens("camera", &[15], 16),
+            ModalitySpec::tokens("left_hand", &[15, 7], 16),
             ModalitySpec::pixels("pixels", [16, 16, 16, 3], [4, 8, 8]),
             ModalitySpec::tokens("rgb", &[5, 2, 2], 200),
         ],
@@ -150,7 +150,7 @@ fn clips_become_tokens_that_the_model_reads_and_the_tokenizer_decodes() {
         assert_eq!(shards.len(), clips);
         for index in 0..clips {
             let sample = shards.read(index).unwrap();
-            assert_eq!(sample.tokens["camera"].ids.len(), 30);
+            assert_eq!(sample.tokens["camera"].ids.len(), 15);
             assert_eq!(sample.tokens["rgb"].ids.len(), 20);
             assert_eq!(sample.pixels["pixels"].len(), 16 * 16 * 16 * 3);
             hands += usize::from(sample.tokens.contains_key("left_hand"));
