@@ -80,7 +80,15 @@ impl super::Run for Compare {
             ..CompareSettings::default()
         };
         settings.interval.level = self.level;
-        let published = self.against.as_deref().map(published).transpose()?;
+        let against = self.against.as_deref().map(|name| {
+            published(&Catalog::linked(), Path::new("./x"), name).ok_or_else(|| {
+                Failure::input(
+                    format!("no published rows `{name}`"),
+                    "`reviv list published` shows all",
+                )
+            })
+        });
+        let published = against.transpose()?;
         let table = compare("", &entrants, &settings, published.as_ref()).map_err(|error| {
             Failure::input(error.to_string(), "`reviv list runs` shows all runs")
         })?;
@@ -100,17 +108,10 @@ impl super::Run for Compare {
     }
 }
 
-/// Published rows by the name of their entry.
-fn published(name: &str) -> Result<Published, Failure> {
-    let catalog = Catalog::linked();
-    load::entry(&catalog, Path::new("./x"), "published", name)
-        .and_then(|value| serde_json::from_value(value).ok())
-        .ok_or_else(|| {
-            Failure::input(
-                format!("no published rows `{name}`"),
-                "`reviv list published` shows all",
-            )
-        })
+/// Published rows by the name of their entry, as a file in `path` sees it.
+pub(super) fn published(catalog: &Catalog, path: &Path, name: &str) -> Option<Published> {
+    let value = load::entry(catalog, path, "published", name)?;
+    serde_json::from_value(value).ok()
 }
 
 impl Compare {

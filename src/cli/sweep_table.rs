@@ -1,15 +1,15 @@
 //! The `compare:` block of a sweep: `report/table.{md,tex,csv}` and `report/table_intervals.svg` of its run, which the run's page shows.
 
-use super::compare::entrants_of;
+use super::compare::{entrants_of, published};
 use super::terminal::Failure;
 use crate::evaluation::compare::{CompareSettings, IntervalSettings, compare};
 use crate::evaluation::intervals;
-use crate::evaluation::published::Published;
 use crate::evaluation::render::{Format, render};
 use crate::evaluation::statistics::Over;
 use crate::experiment::catalog::Catalog;
 use crate::experiment::graph::Resample;
-use crate::experiment::{Compare, Experiment, load};
+use crate::experiment::load;
+use crate::experiment::{Compare, Experiment};
 use crate::run::{RunDirectory, files, report};
 
 /// Writes the table of a finished sweep and its page anew. Gives the table for the terminal.
@@ -20,11 +20,8 @@ pub fn write(
     run: &RunDirectory,
 ) -> Result<String, Failure> {
     let entrants = entrants_of(&run.path().display().to_string(), run.runs())?;
-    let published: Option<Published> = asked
-        .against
-        .as_ref()
-        .and_then(|name| load::entry(catalog, &experiment.path, "published", name))
-        .and_then(|value| serde_json::from_value(value).ok());
+    let against = asked.against.as_ref();
+    let published = against.and_then(|name| published(catalog, &experiment.path, name));
     let over = asked.interval.over.iter().map(|what| match what {
         Resample::Seeds => Over::Seeds,
         Resample::Clips => Over::Clips,

@@ -57,10 +57,7 @@ impl Crew {
     /// One stage after the other.
     #[must_use]
     pub fn alone() -> Self {
-        Self {
-            jobs: 1,
-            ..Self::of_this_machine(Some(1))
-        }
+        Self::of_this_machine(Some(1))
     }
 
     /// Does all of `works`, inputs before their readers, with `make(place, work)`. What depends on something that failed is left

@@ -112,7 +112,10 @@ pub fn is_held(path: &Path) -> bool {
     let Ok(file) = File::open(path) else {
         return false;
     };
-    matches!(file.try_lock_shared(), Err(TryLockError::WouldBlock))
+    let result = file.try_lock_shared();
+    // Not left to closing, as in `Lock::drop`.
+    let _ = file.unlock();
+    matches!(result, Err(TryLockError::WouldBlock))
 }
 
 /// Who signed the lock last.

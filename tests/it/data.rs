@@ -1,15 +1,14 @@
 //! `reviv data` and `op: clips` on recordings: one road for whatever clips come from.
 
 use crate::recordings_bad::neutral_folder;
+use crate::run_text::{failures, run_text};
 use assert_cmd::Command;
 use reviv::clip::store::ClipSet;
-use reviv::experiment::catalog::Catalog;
-use reviv::experiment::load::{Request, load};
 use reviv::formats::npy::NpyArray;
 use reviv::formats::npz::Npz;
 use reviv::formats::png::{Picture, read};
-use reviv::run::execute::{Job, cache_of, execute};
-use reviv::run::{Crew, Interrupt, Progress, State};
+use reviv::run::State;
+use reviv::run::execute::cache_of;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 
@@ -52,29 +51,11 @@ fn reviv(arguments: &[&str]) -> (i32, String, String) {
 }
 
 fn run(folder: &Path, experiment: &str) -> Result<PathBuf, String> {
-    let file = folder.join("experiment.yaml");
-    std::fs::write(&file, experiment).unwrap();
-    let request = Request {
-        path: file,
-        ..Request::default()
-    };
-    let (experiment, report) = load(&Catalog::linked(), &request);
-    let experiment = experiment.ok_or_else(|| report.render(false))?;
-    let runs = folder.join("runs");
-    let outcome = execute(&Job {
-        experiment: &experiment,
-        runs: &runs,
-        only: None,
-        shard: "1/1".parse().unwrap(),
-        crew: Crew::alone(),
-        progress: &Progress::silent(),
-        interrupt: &Interrupt::default(),
-    })
-    .unwrap();
+    let outcome = run_text(folder, experiment)?;
     if outcome.state != State::Done {
-        return Err(outcome.failures.iter().map(ToString::to_string).collect());
+        return Err(failures(&outcome).concat());
     }
-    let mut entries = cache_of(&runs)
+    let mut entries = cache_of(&folder.join("runs"))
         .entries()
         .unwrap()
         .into_iter()

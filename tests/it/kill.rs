@@ -31,6 +31,15 @@ fn victim() {
     }
 }
 
+/// Whether the record of a killed run stops saying that somebody works on it. Killed while it was starting a program (git, for
+/// the record), the process leaves that program with copies of its locks until it has loaded: a moment, longer on a busy machine.
+pub fn comes_to_rest(run: &RunDirectory) -> bool {
+    (0..1000).any(|_| {
+        std::thread::sleep(Duration::from_millis(10));
+        run.read().unwrap().state != State::Running
+    })
+}
+
 #[test]
 fn a_sweep_killed_ten_times_at_random_moments_ends_with_the_bytes_of_an_untouched_one() {
     use rand::RngExt;
@@ -53,9 +62,9 @@ fn a_sweep_killed_ten_times_at_random_moments_ends_with_the_bytes_of_an_untouche
         child.kill().unwrap();
         let ended = child.wait().unwrap();
         survived += u64::from(ended.success());
-        // Whatever was cut off, the record reads.
+        // Whatever was cut off, the record reads, and nobody is said to work on it.
         for run in RunDirectory::all(killed.path()).unwrap() {
-            assert_ne!(run.read().unwrap().state, State::Running, "seed {seed}");
+            assert!(comes_to_rest(&run), "seed {seed}");
         }
     }
     assert!(

@@ -37,6 +37,7 @@ mod language_ops;
 mod plugins;
 mod rules;
 mod run;
+mod run_text;
 mod tensorboard;
 mod tokenizer_ops;
 mod view;

@@ -1,10 +1,11 @@
 //! Modalities that `src/` does not know, from clips to a row of a table: one declared in YAML, one computed by a plug-in crate.
 
+use crate::run_text::{failures, run_text};
 use reviv::evaluation::table::{RowKind, Table};
 use reviv::experiment::catalog::Catalog;
 use reviv::experiment::load::{Request, load};
-use reviv::run::execute::{Job, cache_of, execute};
-use reviv::run::{Crew, Interrupt, Progress, State};
+use reviv::run::State;
+use reviv::run::execute::cache_of;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 
@@ -53,28 +54,9 @@ stages:
 ";
 
 fn run(folder: &Path) -> PathBuf {
-    let file = folder.join("plugins.yaml");
-    std::fs::write(&file, EXPERIMENT).unwrap();
-    let request = Request {
-        path: file,
-        ..Request::default()
-    };
-    let (experiment, report) = load(&Catalog::linked(), &request);
-    let experiment = experiment.unwrap_or_else(|| panic!("{}", report.render(false)));
-    let runs = folder.join("runs");
-    let outcome = execute(&Job {
-        experiment: &experiment,
-        runs: &runs,
-        only: None,
-        shard: "1/1".parse().unwrap(),
-        progress: &Progress::silent(),
-        interrupt: &Interrupt::default(),
-        crew: Crew::alone(),
-    })
-    .unwrap();
-    let failures: Vec<String> = outcome.failures.iter().map(ToString::to_string).collect();
-    assert_eq!(outcome.state, State::Done, "{failures:?}");
-    runs
+    let outcome = run_text(folder, EXPERIMENT).unwrap_or_else(|report| panic!("{report}"));
+    assert_eq!(outcome.state, State::Done, "{:?}", failures(&outcome));
+    folder.join("runs")
 }
 
 /// What a stage of this op (and modality) left, with its manifest's contents.

@@ -1,9 +1,8 @@
 //! `op: statistics` as an experiment runs it.
 
-use reviv::experiment::catalog::Catalog;
-use reviv::experiment::load::{Request, load};
-use reviv::run::execute::{Job, Outcome, cache_of, execute};
-use reviv::run::{Crew, Interrupt, Progress, State};
+use crate::run_text::{failures, run_text};
+use reviv::run::State;
+use reviv::run::execute::{Outcome, cache_of};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 
@@ -20,26 +19,8 @@ stages:
 ";
 
 fn run(folder: &Path, text: &str) -> Result<Outcome, String> {
-    let file = folder.join("experiment.yaml");
-    std::fs::write(&file, text).unwrap();
-    let request = Request {
-        path: file,
-        ..Request::default()
-    };
-    let (experiment, report) = load(&Catalog::linked(), &request);
-    let experiment = experiment.ok_or_else(|| report.render(false))?;
-    let outcome = execute(&Job {
-        experiment: &experiment,
-        runs: &folder.join("runs"),
-        only: None,
-        shard: "1/1".parse().unwrap(),
-        crew: Crew::alone(),
-        progress: &Progress::silent(),
-        interrupt: &Interrupt::default(),
-    })
-    .unwrap();
-    let failures: Vec<String> = outcome.failures.iter().map(ToString::to_string).collect();
-    assert_eq!(outcome.state, State::Done, "{failures:?}");
+    let outcome = run_text(folder, text)?;
+    assert_eq!(outcome.state, State::Done, "{:?}", failures(&outcome));
     Ok(outcome)
 }
 

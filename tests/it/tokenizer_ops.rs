@@ -1,10 +1,9 @@
 //! `op: train_tokenizer` and `op: tokenize` as an experiment runs them: from clips of the built-in world to token shards.
 
-use reviv::experiment::catalog::Catalog;
-use reviv::experiment::load::{Request, load};
+use crate::run_text::{failures, run_text};
 use reviv::mget::{MgetSpec, ModalitySpec, Positions, Size};
-use reviv::run::execute::{Job, cache_of, execute};
-use reviv::run::{Crew, Interrupt, Progress, State};
+use reviv::run::State;
+use reviv::run::execute::cache_of;
 use reviv::training::{Shards, TokenSource};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
@@ -52,29 +51,10 @@ stages:
 
 /// Runs the experiment; gives every artifact by its op and modality.
 fn run(folder: &Path) -> Vec<(String, PathBuf, Value)> {
-    let file = folder.join("tiny.yaml");
-    std::fs::write(&file, EXPERIMENT).unwrap();
-    let request = Request {
-        path: file,
-        ..Request::default()
-    };
-    let (experiment, report) = load(&Catalog::linked(), &request);
-    let experiment = experiment.unwrap_or_else(|| panic!("{}", report.render(false)));
-    let runs = folder.join("runs");
-    let outcome = execute(&Job {
-        experiment: &experiment,
-        runs: &runs,
-        only: None,
-        shard: "1/1".parse().unwrap(),
-        crew: Crew::alone(),
-        progress: &Progress::silent(),
-        interrupt: &Interrupt::default(),
-    })
-    .unwrap();
-    let failures: Vec<String> = outcome.failures.iter().map(ToString::to_string).collect();
-    assert_eq!(outcome.state, State::Done, "{failures:?}");
+    let outcome = run_text(folder, EXPERIMENT).unwrap_or_else(|report| panic!("{report}"));
+    assert_eq!(outcome.state, State::Done, "{:?}", failures(&outcome));
     let mut artifacts = Vec::new();
-    for leaf in cache_of(&runs).entries().unwrap() {
+    for leaf in cache_of(&folder.join("runs")).entries().unwrap() {
         let Ok(text) = std::fs::read_to_string(leaf.path.join("manifest.json")) else {
             continue;
         };

@@ -4,7 +4,6 @@ use super::aim::aim;
 use super::{Hold, Look, Reach, Writer};
 use crate::random::StreamRng;
 use crate::source::world::hand::Fingers;
-use crate::source::world::track::Key;
 use crate::source::world::wearer::{LEFT, RIGHT, Side, sign, yaw_pitch};
 use nalgebra::{Point3, Vector3};
 use rand::RngExt;
@@ -18,16 +17,7 @@ impl Writer<'_> {
         let end = up + rng.random_range(0.7..1.0);
         let keys = [(self.now, down, depth, lean), (up, end, 0.0, 0.05)];
         for (start, end, crouch, lean) in keys {
-            self.plan.crouch.push(Key {
-                start,
-                end,
-                value: crouch,
-            });
-            self.plan.lean.push(Key {
-                start,
-                end,
-                value: lean,
-            });
+            self.bend(start, end, crouch, lean);
         }
         self.look(
             self.now - 0.1,
