@@ -8,7 +8,6 @@ use crate::evaluation::render::{Format, render};
 use crate::evaluation::statistics::Over;
 use crate::experiment::catalog::Catalog;
 use crate::experiment::graph::Resample;
-use crate::experiment::load;
 use crate::experiment::{Compare, Experiment};
 use crate::run::{RunDirectory, files, report};
 
