@@ -1,5 +1,7 @@
 //! Normalisation of each frame over all its pixels and channels (group norm with one group), with SiLU if wanted, as one
 //! operation on packed rows `[frames * pixels, channels]`.
+// Vector instructions reach only what is inlined.
+#![allow(clippy::inline_always)]
 
 use burn::backend::{Autodiff, Dispatch, Flex, backend_extension, tensor::FloatTensor};
 use burn::tensor::{Tensor, TensorData};
@@ -9,6 +11,8 @@ use burn_autodiff::ops::{Backward, Ops, OpsKind};
 use burn_flex::FlexTensor;
 use rayon::prelude::*;
 use std::sync::Arc;
+
+use super::vector;
 
 /// Added to the variance.
 const EPSILON: f32 = 1e-6;
@@ -211,19 +215,22 @@ impl Held {
             y.par_chunks_mut(ROWS * self.channels)
                 .zip(x.par_chunks(ROWS * self.channels))
                 .for_each(|(y, x)| {
-                    for (y, x) in y
-                        .chunks_exact_mut(self.channels)
-                        .zip(x.chunks_exact(self.channels))
-                    {
-                        for (((y, x), w), b) in y.iter_mut().zip(x).zip(weight).zip(bias) {
-                            *y = (x - mean) * scale * w + b;
-                        }
-                        if self.silu {
-                            for y in y {
-                                *y *= sigmoid(*y);
+                    vector::vectorised(
+                        #[inline(always)]
+                        || {
+                            let rows = y.chunks_exact_mut(self.channels);
+                            for (y, x) in rows.zip(x.chunks_exact(self.channels)) {
+                                for (((y, x), w), b) in y.iter_mut().zip(x).zip(weight).zip(bias) {
+                                    *y = (x - mean) * scale * w + b;
+                                }
+                                if self.silu {
+                                    for y in y {
+                                        *y *= vector::sigmoid(*y);
+                                    }
+                                }
                             }
-                        }
-                    }
+                        },
+                    );
                 });
         }
         tensor(y, &[self.rows(), self.channels])
@@ -245,33 +252,42 @@ impl Held {
                 // First the gradients of weight and bias, and the two means that the input's gradient needs; `dx` holds the
                 // gradient of the normalised values meanwhile.
                 let mut affine = vec![0.0_f64; 2 * channels];
-                let (mut sum, mut product) = (0.0_f64, 0.0_f64);
-                for ((dx, x), dy) in dx
-                    .chunks_exact_mut(channels)
-                    .zip(x.chunks_exact(channels))
-                    .zip(dy.chunks_exact(channels))
-                {
-                    for c in 0..channels {
-                        let normal = (x[c] - mean) * scale;
-                        let mut d = dy[c];
-                        if self.silu {
-                            let y = normal * weight[c] + bias[c];
-                            let s = sigmoid(y);
-                            d *= s * (1.0 + y * (1.0 - s));
+                vector::vectorised(
+                    #[inline(always)]
+                    || {
+                        let (weight, bias) = (&weight[..channels], &bias[..channels]);
+                        let (dweight, dbias) = affine.split_at_mut(channels);
+                        let (dweight, dbias) = (&mut dweight[..channels], &mut dbias[..channels]);
+                        let mut normal = vec![0.0_f32; channels];
+                        let (mut sum, mut product) = (0.0_f64, 0.0_f64);
+                        for ((dx, x), dy) in dx
+                            .chunks_exact_mut(channels)
+                            .zip(x.chunks_exact(channels))
+                            .zip(dy.chunks_exact(channels))
+                        {
+                            for c in 0..channels {
+                                normal[c] = (x[c] - mean) * scale;
+                                let mut d = dy[c];
+                                if self.silu {
+                                    let y = normal[c] * weight[c] + bias[c];
+                                    let s = vector::sigmoid(y);
+                                    d *= s * (1.0 + y * (1.0 - s));
+                                }
+                                dweight[c] += f64::from(d * normal[c]);
+                                dbias[c] += f64::from(d);
+                                dx[c] = d * weight[c];
+                            }
+                            sum += f64::from(vector::sum(dx));
+                            product += f64::from(vector::dot(dx, &normal));
                         }
-                        affine[c] += f64::from(d * normal);
-                        affine[channels + c] += f64::from(d);
-                        dx[c] = d * weight[c];
-                        sum += f64::from(dx[c]);
-                        product += f64::from(dx[c] * normal);
-                    }
-                }
-                let count = x.len() as f64;
-                let (sum, product) = ((sum / count) as f32, (product / count) as f32);
-                for (dx, x) in dx.iter_mut().zip(x) {
-                    let normal = (x - mean) * scale;
-                    *dx = scale * (*dx - sum - normal * product);
-                }
+                        let count = x.len() as f64;
+                        let (sum, product) = ((sum / count) as f32, (product / count) as f32);
+                        for (dx, x) in dx.iter_mut().zip(x) {
+                            let normal = (x - mean) * scale;
+                            *dx = scale * (*dx - sum - normal * product);
+                        }
+                    },
+                );
                 affine
             })
             .collect();
@@ -292,6 +308,14 @@ impl Held {
 
 /// Sum and sum of squares.
 fn sums(block: &[f32]) -> [f64; 2] {
+    vector::vectorised(
+        #[inline(always)]
+        || sums_of_parts(block),
+    )
+}
+
+#[inline(always)]
+fn sums_of_parts(block: &[f32]) -> [f64; 2] {
     const LANES: usize = 16;
     let (mut sum, mut square) = (0.0, 0.0);
     for part in block.chunks(1024) {
@@ -313,31 +337,6 @@ fn sums(block: &[f32]) -> [f64; 2] {
         }
     }
     [sum, square]
-}
-
-/// `1 / (1 + exp(-x))`, in a form that vectorises.
-#[inline]
-fn sigmoid(x: f32) -> f32 {
-    1.0 / (1.0 + exponential(-x))
-}
-
-/// `exp(x)` to about one unit in the last place (Cephes' polynomial), in a form that vectorises.
-#[inline]
-#[allow(clippy::excessive_precision)] // the published coefficients
-fn exponential(x: f32) -> f32 {
-    // Adding and subtracting 1.5 * 2^23 rounds to the nearest integer.
-    const ROUND: f32 = 12_582_912.0;
-    let x = x.clamp(-87.0, 88.0);
-    let n = (x * std::f32::consts::LOG2_E + ROUND) - ROUND;
-    let f = (x - n * 0.693_359_375) - n * -2.121_944_40e-4;
-    let p = 1.987_569_150_0e-4_f32;
-    let p = p * f + 1.398_199_950_7e-3;
-    let p = p * f + 8.333_451_907_3e-3;
-    let p = p * f + 4.166_579_589_4e-2;
-    let p = p * f + 1.666_666_545_9e-1;
-    let p = p * f + 5.000_000_120_1e-1;
-    let p = p * f * f + f + 1.0;
-    p * f32::from_bits((((n as i32) + 127) << 23) as u32)
 }
 
 #[cfg(test)]
@@ -375,16 +374,6 @@ mod tests {
             for (a, b) in run(true).iter().zip(run(false)) {
                 assert!((a - b).abs() < 1e-4 * b.abs().max(1.0), "{a} {b}");
             }
-        }
-    }
-
-    #[test]
-    fn the_exponential_is_exact_to_a_few_units() {
-        for i in -8000..8000 {
-            let x = i as f32 * 0.01;
-            let exact = f64::from(x).exp();
-            let relative = (f64::from(exponential(x)) - exact).abs() / exact;
-            assert!(relative < 3e-7, "{x}: {relative}");
         }
     }
 }

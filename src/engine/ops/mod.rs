@@ -9,6 +9,7 @@ mod frame_norm;
 mod fused;
 mod gemm;
 mod nearest;
+mod vector;
 
 pub use convolution::{Taps, convolve};
 pub use frame_norm::frame_norm;

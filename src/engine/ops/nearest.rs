@@ -1,8 +1,11 @@
 //! The nearest code of every vector, on the host: the look-up of a codebook.
+// Vector instructions reach only what is inlined.
+#![allow(clippy::inline_always)]
 
 use rayon::prelude::*;
 
 use super::gemm::{Matrix, gemm};
+use super::vector;
 
 /// Vectors per task: fixed, so results do not depend on the number of threads.
 const ROWS: usize = 128;
@@ -31,18 +34,10 @@ pub fn nearest(x: &[f32], codes: &[f32], width: usize) -> Vec<u32> {
 
 /// The index of the largest value, the first of several.
 fn largest(row: &[f32]) -> u32 {
-    const LANES: usize = 16;
-    let mut lanes = [f32::NEG_INFINITY; LANES];
-    let (chunks, rest) = row.as_chunks::<LANES>();
-    for chunk in chunks {
-        for (lane, value) in lanes.iter_mut().zip(chunk) {
-            *lane = lane.max(*value);
-        }
-    }
-    let top = lanes
-        .iter()
-        .chain(rest)
-        .fold(f32::NEG_INFINITY, |a, b| a.max(*b));
+    let top = vector::vectorised(
+        #[inline(always)]
+        || vector::largest(row),
+    );
     row.iter()
         .position(|value| *value == top)
         .map_or(0, |index| index as u32)

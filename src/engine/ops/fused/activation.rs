@@ -16,11 +16,12 @@ fn map<const N: usize>(inputs: [&[f32]; N], f: impl Fn([f32; N]) -> f32 + Sync) 
     y.par_chunks_mut(ELEMENTS)
         .enumerate()
         .for_each(|(task, y)| {
-            let start = task * ELEMENTS;
-            let inputs = inputs.map(|x| &x[start..start + y.len()]);
+            let inputs = inputs.map(|x| &x[task * ELEMENTS..]);
             vector::vectorised(
                 #[inline(always)]
                 || {
+                    // An index that has to be checked keeps a loop from becoming vector instructions.
+                    let inputs = inputs.map(|x| &x[..y.len()]);
                     for (i, y) in y.iter_mut().enumerate() {
                         *y = f(inputs.map(|x| x[i]));
                     }
@@ -72,17 +73,12 @@ impl Kernel for Gelu {
 #[derive(Debug)]
 pub struct SwiGlu;
 
-#[inline(always)]
-fn sigmoid(x: f32) -> f32 {
-    1.0 / (1.0 + vector::exp(-x))
-}
-
 impl Kernel for SwiGlu {
     fn forward(&self, [gate, value, _]: [&Array; 3]) -> (Array, Saved) {
         let y = map(
             [gate.values(), value.values()],
             #[inline(always)]
-            |[gate, value]| gate * sigmoid(gate) * value,
+            |[gate, value]| gate * vector::sigmoid(gate) * value,
         );
         (Array::new(y, &gate.shape()), Saved::default())
     }
@@ -94,19 +90,29 @@ impl Kernel for SwiGlu {
         dy: &Array,
         _: [bool; 3],
     ) -> [Option<Array>; 3] {
-        let dgate = map(
-            [gate.values(), value.values(), dy.values()],
-            #[inline(always)]
-            |[gate, value, dy]| {
-                let s = sigmoid(gate);
-                dy * value * s * (1.0 + gate * (1.0 - s))
-            },
-        );
-        let dvalue = map(
-            [gate.values(), dy.values()],
-            #[inline(always)]
-            |[gate, dy]| dy * gate * sigmoid(gate),
-        );
+        let length = gate.values().len();
+        let (mut dgate, mut dvalue) = (vec![0.0; length], vec![0.0; length]);
+        dgate
+            .par_chunks_mut(ELEMENTS)
+            .zip(dvalue.par_chunks_mut(ELEMENTS))
+            .zip(gate.values().par_chunks(ELEMENTS))
+            .zip(value.values().par_chunks(ELEMENTS))
+            .zip(dy.values().par_chunks(ELEMENTS))
+            .for_each(|((((dgate, dvalue), gate), value), dy)| {
+                vector::vectorised(
+                    #[inline(always)]
+                    || {
+                        let slopes = dgate.iter_mut().zip(dvalue);
+                        for ((slopes, gate), (value, dy)) in
+                            slopes.zip(gate).zip(value.iter().zip(dy))
+                        {
+                            let s = vector::sigmoid(*gate);
+                            *slopes.0 = dy * value * s * (1.0 + gate * (1.0 - s));
+                            *slopes.1 = dy * gate * s;
+                        }
+                    },
+                );
+            });
         let shape = gate.shape();
         [
             Some(Array::new(dgate, &shape)),

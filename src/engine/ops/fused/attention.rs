@@ -224,11 +224,19 @@ impl Kernel for Attention<'_> {
                         gemm(dp, d, v.transposed());
                         let logs = &saved.numbers[head * rows + row..][..count];
                         let start = row * layout.width + head * layout.head;
-                        softmax_backward(p, dp, keys, logs, layout.scale, |i| {
-                            let own =
-                                start + i * layout.width..start + i * layout.width + layout.head;
-                            vector::dot(&dy.values()[own.clone()], &output[own])
-                        });
+                        softmax_backward(
+                            p,
+                            dp,
+                            keys,
+                            logs,
+                            layout.scale,
+                            #[inline(always)]
+                            |i| {
+                                let row = start + i * layout.width;
+                                let own = row..row + layout.head;
+                                vector::dot(&dy.values()[own.clone()], &output[own])
+                            },
+                        );
                         let (p, dp) = (Matrix::rows(p, count, keys), Matrix::rows(dp, count, keys));
                         let stride = layout.kv_stride;
                         // SAFETY: this task alone writes the columns of its head, in the rows of its group: groups have no key in

@@ -40,6 +40,7 @@ impl Kernel for LayerNorm {
                 vector::vectorised(
                     #[inline(always)]
                     || {
+                        let (weight, bias) = (&weight[..width], &bias[..width]);
                         let rows = y.chunks_exact_mut(width).zip(x.chunks_exact(width));
                         for ((y, x), statistics) in rows.zip(statistics.chunks_exact_mut(2)) {
                             let mean = vector::sum(x) / width as f32;
@@ -80,6 +81,8 @@ impl Kernel for LayerNorm {
                 vector::vectorised(
                     #[inline(always)]
                     || {
+                        let weight = &weight[..width];
+                        let (dweight, dbias) = (&mut dweight[..width], &mut dbias[..width]);
                         let mut hat = vec![0.0_f32; width];
                         let mut slope = vec![0.0_f32; width];
                         let rows = dx.chunks_exact_mut(width).zip(x.chunks_exact(width));

@@ -10,7 +10,6 @@ mod cross_entropy;
 mod flat;
 mod layer_norm;
 mod linear;
-mod vector;
 
 use std::sync::Arc;
 
@@ -25,6 +24,7 @@ use burn_flex::FlexTensor;
 pub use flat::{adamw, sum_of_squares};
 
 use super::super::Segments;
+use super::vector;
 
 /// An array on the host: dense, row-major, f32.
 #[derive(Debug, Clone)]

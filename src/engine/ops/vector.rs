@@ -13,46 +13,52 @@ pub fn vectorised<R>(body: impl FnOnce() -> R) -> R {
     pulp::Arch::new().dispatch(body)
 }
 
-/// The sum of `term(i)`.
+/// The sum of `term(i-th values of the arrays)`.
 #[inline(always)]
-fn reduce(length: usize, term: impl Fn(usize) -> f32) -> f32 {
+fn reduce<const N: usize>(arrays: [&[f32]; N], term: impl Fn([f32; N]) -> f32) -> f32 {
+    // Chunks of a known length: an index that has to be checked keeps a loop from becoming vector instructions.
+    let arrays = arrays.map(<[f32]>::as_chunks::<LANES>);
+    let whole = arrays.iter().map(|(chunks, _)| chunks.len()).min();
+    let rest = arrays.iter().map(|(_, rest)| rest.len()).min();
+    let (whole, rest) = (whole.unwrap_or(0), rest.unwrap_or(0));
+    let chunks = arrays.map(|(chunks, _)| &chunks[..whole]);
+    let rests = arrays.map(|(_, values)| &values[..rest]);
     let mut lanes = [0.0_f32; LANES];
-    let whole = length - length % LANES;
-    let mut start = 0;
-    while start < whole {
+    for place in 0..whole {
+        let chunks = chunks.map(|chunks| &chunks[place]);
         for (lane, sum) in lanes.iter_mut().enumerate() {
-            *sum += term(start + lane);
+            *sum += term(chunks.map(|chunk| chunk[lane]));
         }
-        start += LANES;
     }
     let mut sum = lanes.iter().sum::<f32>();
-    for i in whole..length {
-        sum += term(i);
+    for place in 0..rest {
+        sum += term(rests.map(|values| values[place]));
     }
     sum
 }
 
 #[inline(always)]
 pub fn sum(x: &[f32]) -> f32 {
-    reduce(x.len(), |i| x[i])
+    reduce([x], |[x]| x)
 }
 
 /// The sum of `(x - mean)^2`.
 #[inline(always)]
 pub fn squares_about(x: &[f32], mean: f32) -> f32 {
-    reduce(x.len(), |i| (x[i] - mean) * (x[i] - mean))
+    reduce([x], |[x]| (x - mean) * (x - mean))
 }
 
 /// The sum of `e^(x - top)`.
 #[inline(always)]
 pub fn sum_of_exp(x: &[f32], top: f32) -> f32 {
-    reduce(x.len(), |i| exp(x[i] - top))
+    reduce([x], |[x]| exp(x - top))
 }
 
+/// The inner product; of the shorter length if they differ.
 #[inline(always)]
 pub fn dot(a: &[f32], b: &[f32]) -> f32 {
-    let b = &b[..a.len()];
-    reduce(a.len(), |i| a[i] * b[i])
+    let length = a.len().min(b.len());
+    reduce([&a[..length], &b[..length]], |[a, b]| a * b)
 }
 
 /// The largest value; negative infinity of none.
@@ -79,7 +85,8 @@ pub fn exp(x: f32) -> f32 {
     const ROUND: f32 = 12_582_912.0;
     let capped = if x > 88.3 { 88.3 } else { x };
     let floored = if capped < -87.3 { -87.3 } else { capped };
-    let n = (floored * LOG2_E + ROUND) - ROUND;
+    let rounded = floored * LOG2_E + ROUND;
+    let n = rounded - ROUND;
     // ln 2 in two parts: the first has few bits, so the product is exact.
     let f = (floored - n * 0.693_359_375) + n * 2.121_944_4e-4;
     let mut p = 1.987_569_15e-4_f32;
@@ -93,8 +100,16 @@ pub fn exp(x: f32) -> f32 {
         p = p * f + coefficient;
     }
     let e = p * f * f + f + 1.0;
-    let power = f32::from_bits(((n as i32 + 127) << 23) as u32);
+    // The rounded number's last bits are the integer. A cast would check for overflow, which has no vector instructions.
+    let integer = rounded.to_bits().wrapping_sub(ROUND.to_bits());
+    let power = f32::from_bits(integer.wrapping_add(127) << 23);
     if x < -87.3 { 0.0 } else { e * power }
+}
+
+/// `1 / (1 + e^-x)`.
+#[inline(always)]
+pub fn sigmoid(x: f32) -> f32 {
+    1.0 / (1.0 + exp(-x))
 }
 
 /// The error function as a ratio of polynomials on [-4, 4] (the approximation of Eigen and XLA); absolute error below 4e-7.
