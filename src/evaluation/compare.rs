@@ -9,6 +9,7 @@ use super::statistics::{
     student_interval, summarise,
 };
 use super::table::{Cell, Row, RowKind, Table};
+use super::verdict;
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -161,6 +162,8 @@ pub fn compare(
         rows,
         notes: notes(entrants, settings, &common, published),
     };
+    let verdicts = verdict::against_trivial(&table);
+    table.notes.splice(0..0, verdicts);
     table.mark_best();
     Ok(table)
 }

@@ -3,7 +3,7 @@
 //! Read in this order: [`outcome`] (what a metric can say), the metrics [`joints`], [`trajectory`], [`gaze`], [`depth`],
 //! [`motion`], [`tokens`], [`runtime`]; then [`evaluate`] (every clip of a [`suite`] into [`scores`]), [`statistics`], and [`compare`]
 //! (many scores into one [`table`], which [`render`] prints and
-//! [`intervals`] draws). [`tum`] compares trajectory files.
+//! [`intervals`] draws; `verdict` says what beats the trivial baselines). [`tum`] compares trajectory files.
 //!
 //! Arithmetic is f64; inputs are metres and seconds; angles are reported in degrees.
 
@@ -39,5 +39,6 @@ pub mod table;
 pub mod tokens;
 pub mod trajectory;
 pub mod tum;
+mod verdict;
 
 pub use outcome::{Outcome, Refusal};

@@ -42,7 +42,7 @@ impl Op for TableOp {
     }
 
     fn version(&self) -> u32 {
-        2
+        3
     }
 
     fn about(&self) -> &'static str {
