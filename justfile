@@ -19,9 +19,13 @@ ci:
 check:
     cargo clippy --all-targets -- -D warnings
 
-# Speed: recording, checking, planning, engine.
+# Speed of recording, checking, planning, reading, evaluating: `just bench --bench run`.
 bench *NAME:
     cargo bench {{ NAME }}
+
+# Speed of models beside PyTorch: `just speed --python PATH`, with a Python that has it.
+speed *ARGUMENTS:
+    cargo bench --bench speed -- {{ ARGUMENTS }}
 
 # The editor's schema, after a setting has changed.
 schema:

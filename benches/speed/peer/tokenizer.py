@@ -1,21 +1,16 @@
-"""The VQ-VAE of bodies at the paper's size in PyTorch eager, f32, on the CPU: what benches/engine.rs compares with.
-
-Arguments: clips per step, repetitions, threads. Prints best wall and processor seconds of a train step, a forward pass and
-encoding alone, then the peak memory in MB.
-"""
-
-import resource
-import sys
-import time
+"""The VQ-VAE of bodies at the paper's size (ViT-B)."""
 
 import torch
 from torch import nn
 from torch.nn import functional as F
 
-BATCH, REPEATS, THREADS = (int(word) for word in sys.argv[1:4])
+from measure import adamw, measure
+
+# Clips per step; samples, joints and coordinates of a clip.
+BATCH, CLIP = 8, (60, 21, 3)
 WIDTH, DEPTH, HEADS, CODES, CODE_WIDTH = 768, 12, 12, 2048, 32
-torch.set_num_threads(THREADS)
-torch.manual_seed(0)
+# A token covers 2 samples of 3 joints: a grid of 30 x 7.
+TOKENS = 30 * 7
 
 
 class Block(nn.Module):
@@ -37,9 +32,9 @@ class Block(nn.Module):
 
 
 class Transformer(nn.Module):
-    def __init__(self, tokens):
+    def __init__(self):
         super().__init__()
-        self.register_buffer("positions", torch.randn(1, tokens, WIDTH))
+        self.register_buffer("positions", torch.randn(1, TOKENS, WIDTH))
         self.blocks = nn.ModuleList(Block() for _ in range(DEPTH))
         self.norm = nn.LayerNorm(WIDTH, eps=1e-6)
         self.post1 = nn.Linear(WIDTH, 4 * WIDTH)
@@ -56,14 +51,15 @@ class VqVae(nn.Module):
     def __init__(self):
         super().__init__()
         self.conv = nn.Conv2d(3, WIDTH, (2, 3), stride=(2, 3))
-        self.encoder, self.decoder = Transformer(210), Transformer(210)
+        self.encoder, self.decoder = Transformer(), Transformer()
         self.to_code = nn.Linear(WIDTH, CODE_WIDTH)
         self.from_code = nn.Linear(CODE_WIDTH, WIDTH)
-        self.out = nn.Linear(WIDTH, 18)
+        self.out = nn.Linear(WIDTH, 2 * 3 * 3)
         self.register_buffer("codes", F.normalize(torch.randn(CODES, CODE_WIDTH), dim=-1))
         self.register_buffer("counts", torch.zeros(CODES))
 
     def encode(self, x):
+        """Latents, the same at unit length, and the nearest code of each."""
         h = self.conv(x.permute(0, 3, 1, 2)).flatten(2).transpose(1, 2)
         z = self.to_code(self.encoder(h))
         unit = F.normalize(z.detach().flatten(0, 1), dim=-1)
@@ -72,10 +68,11 @@ class VqVae(nn.Module):
     def decode(self, q):
         y = self.out(self.decoder(self.from_code(q)))
         y = y.view(-1, 30, 7, 3, 2, 3).permute(0, 1, 4, 2, 5, 3)
-        return y.reshape(-1, 60, 21, 3)
+        return y.reshape(-1, *CLIP)
 
     @torch.no_grad()
     def update(self, unit, ids):
+        """Running means of codes and counts; codes that are hardly used become latents of the batch."""
         n = torch.bincount(ids, minlength=CODES).float()
         sums = torch.zeros_like(self.codes).index_add_(0, ids, unit)
         mean = torch.where(n[:, None] > 0, F.normalize(sums, dim=-1), F.normalize(self.codes, dim=-1))
@@ -85,45 +82,32 @@ class VqVae(nn.Module):
         self.codes[dead] = unit[torch.randint(len(unit), (int(dead.sum()),))]
 
 
-model = VqVae()
-clips = torch.sin(0.017 * torch.arange(BATCH * 3780).float()).view(BATCH, 60, 21, 3)
-decay = [p for n, p in model.named_parameters() if not ("norm" in n or n.endswith("bias"))]
-rest = [p for n, p in model.named_parameters() if "norm" in n or n.endswith("bias")]
-optimizer = torch.optim.AdamW(
-    [{"params": decay, "weight_decay": 0.05}, {"params": rest, "weight_decay": 0.0}], lr=1e-4, betas=(0.9, 0.99)
-)
+def run(repeats):
+    model = VqVae()
+    clips = torch.sin(0.017 * torch.arange(BATCH * 60 * 21 * 3).float()).view(BATCH, *CLIP)
 
+    @torch.inference_mode()
+    def encode():
+        return model.encode(clips)[2].tolist()
 
-def step():
-    z, unit, ids = model.encode(clips)
-    q = model.codes[ids].view_as(z)
-    loss = F.mse_loss(model.decode(z + (q - z).detach()), clips) + F.mse_loss(z, q)
-    optimizer.zero_grad()
-    loss.backward()
-    torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
-    optimizer.step()
-    model.update(unit, ids)
-    return loss.item()
+    @torch.inference_mode()
+    def forward():
+        z, _, ids = model.encode(clips)
+        return model.decode(model.codes[ids].view_as(z)).numpy()
 
+    measure("encode", repeats, encode)
+    measure("forward", repeats, forward)
+    optimizer = adamw(model, 1e-4, (0.9, 0.99))
 
-@torch.no_grad()
-def forward():
-    z, _, ids = model.encode(clips)
-    return model.decode(model.codes[ids].view_as(z)).sum().item()
+    def step():
+        z, unit, ids = model.encode(clips)
+        q = model.codes[ids].view_as(z)
+        loss = F.mse_loss(model.decode(z + (q - z).detach()), clips) + F.mse_loss(z, q)
+        optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
+        optimizer.step()
+        model.update(unit, ids)
+        return loss.item()
 
-
-@torch.no_grad()
-def encode():
-    return model.encode(clips)[2].sum().item()
-
-
-for run in (step, forward, encode):
-    run()
-    wall, processor = [], []
-    for _ in range(REPEATS):
-        start = time.perf_counter(), time.process_time()
-        run()
-        wall.append(time.perf_counter() - start[0])
-        processor.append(time.process_time() - start[1])
-    print(min(wall), min(processor), flush=True)
-print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
+    measure("train step", repeats, step)

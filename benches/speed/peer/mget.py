@@ -1,19 +1,18 @@
-"""The computation of benches/mget.rs in plain PyTorch: prints seconds of a training step and of a forward pass.
-
-usage: peer_mget.py tiny|base THREADS
-"""
+"""MGET: one training step and one forward pass, at two sizes."""
 
 import math
-import statistics
-import sys
-import time
 
 import torch
 from torch import nn
 from torch.nn import functional as F
 
-CASES = {"tiny": (384, 6, 6, 8, 256, 5), "base": (768, 12, 12, 1, 1024, 3)}
-# Name, tokens, vocabulary; the order is that of the benchmark's spec.
+from measure import adamw, measure
+
+# Width, heads, depth.
+SIZES = {"tiny": (384, 6, 6), "base": (768, 12, 12)}
+# Samples, and tokens on each side.
+BATCHES = {"tiny": (8, 256), "base": (1, 1024)}
+# Name, tokens, vocabulary.
 MODALITIES = [("body", 210, 2048), ("camera", 30, 256), ("depth", 5120, 64000), ("gaze", 30, 512), ("rgb", 5120, 64000)]
 
 
@@ -43,8 +42,9 @@ class Attention(nn.Module):
 
 
 class SwiGlu(nn.Module):
-    def __init__(self, width, hidden):
+    def __init__(self, width):
         super().__init__()
+        hidden = 2 * (4 * width) // 3
         self.fc1 = nn.Linear(width, hidden, bias=False)
         self.fc3 = nn.Linear(width, hidden, bias=False)
         self.fc2 = nn.Linear(hidden, width, bias=False)
@@ -58,10 +58,10 @@ def norm(width):
 
 
 class Encoder(nn.Module):
-    def __init__(self, width, heads, hidden):
+    def __init__(self, width, heads):
         super().__init__()
         self.norm1, self.norm2 = norm(width), norm(width)
-        self.attn, self.mlp = Attention(width, heads), SwiGlu(width, hidden)
+        self.attn, self.mlp = Attention(width, heads), SwiGlu(width)
 
     def forward(self, x):
         x = x + self.attn(self.norm1(x))
@@ -69,29 +69,32 @@ class Encoder(nn.Module):
 
 
 class Decoder(nn.Module):
-    def __init__(self, width, heads, hidden):
+    def __init__(self, width, heads):
         super().__init__()
         self.norm1, self.norm2, self.query_norm, self.context_norm = (norm(width) for _ in range(4))
         self.self_attn, self.cross_attn = Attention(width, heads), Attention(width, heads, cross=True)
-        self.mlp = SwiGlu(width, hidden)
+        self.mlp = SwiGlu(width)
 
     def forward(self, y, context, mask):
         y = y + self.self_attn(self.norm1(y), mask=mask)
-        y = y + self.cross_attn(self.query_norm(y), self.context_norm(context))
+        if context is not None:
+            y = y + self.cross_attn(self.query_norm(y), self.context_norm(context))
         return y + self.mlp(self.norm2(y))
 
 
 class Mget(nn.Module):
-    def __init__(self, width, heads, depth):
+    """Tokens are given and asked for by modality: `{name: positions}`, the same for all samples."""
+
+    def __init__(self, size):
         super().__init__()
-        hidden = 2 * (4 * width) // 3
+        width, heads, depth = SIZES[size]
         self.inputs = nn.ModuleDict({m: nn.Embedding(v, width) for m, _, v in MODALITIES})
         self.outputs = nn.ModuleDict({m: nn.Linear(width, v, bias=False) for m, _, v in MODALITIES})
         self.vectors = nn.ParameterDict({m: nn.Parameter(torch.randn(width) * 0.02) for m, _, _ in MODALITIES})
         self.places = {m: torch.randn(n, width) for m, n, _ in MODALITIES}
         self.mask_token = nn.Parameter(torch.randn(width) * 0.02)
-        self.encoder = nn.ModuleList(Encoder(width, heads, hidden) for _ in range(depth))
-        self.decoder = nn.ModuleList(Decoder(width, heads, hidden) for _ in range(depth))
+        self.encoder = nn.ModuleList(Encoder(width, heads) for _ in range(depth))
+        self.decoder = nn.ModuleList(Decoder(width, heads) for _ in range(depth))
         self.encoder_norm, self.decoder_norm = norm(width), norm(width)
         self.context = nn.Linear(width, width)
         for table in self.inputs.values():
@@ -100,69 +103,77 @@ class Mget(nn.Module):
     def place(self, positions):
         return torch.cat([self.places[m][p] + self.vectors[m] for m, p in positions.items()])
 
-    def forward(self, given, asked, ids, mask):
+    def encode(self, given, ids):
+        """`ids[m]` is `[samples, tokens of m]`; gives what the decoder sees."""
         x = torch.cat([self.inputs[m](ids[m][:, p]) for m, p in given.items()], 1)
         place = self.place(given)
         h = x + place
         for block in self.encoder:
             h = block(h)
-        context = self.context(self.encoder_norm(h)) + place
-        y = (self.place(asked) + self.mask_token).expand(x.shape[0], -1, -1)
+        return self.context(self.encoder_norm(h)) + place
+
+    def decode(self, context, asked, samples):
+        """Answers by modality. Asked tokens of different modalities do not see each other."""
+        mask = None
+        if len(asked) > 1:
+            kinds = torch.cat([torch.full((len(p),), i) for i, p in enumerate(asked.values())])
+            mask = (kinds[:, None] == kinds[None, :])[None, None]
+        y = (self.place(asked) + self.mask_token).expand(samples, -1, -1)
         for block in self.decoder:
             y = block(y, context, mask)
-        y = self.decoder_norm(y)
-        total, start = 0.0, 0
-        for m, p in asked.items():
-            logits = self.outputs[m](y[:, start : start + len(p)])
-            total = total + F.cross_entropy(logits.flatten(0, 1), ids[m][:, p].flatten())
-            start += len(p)
-        return total / len(MODALITIES)
+        parts = self.decoder_norm(y).split([len(p) for p in asked.values()], 1)
+        return dict(zip(asked, parts))
+
+    def forward(self, given, asked, ids):
+        """The mean over modalities of their cross-entropies."""
+        samples = len(next(iter(ids.values())))
+        answers = self.decode(self.encode(given, ids), asked, samples)
+        losses = [
+            F.cross_entropy(self.outputs[m](answers[m]).flatten(0, 1), ids[m][:, p].flatten()) for m, p in asked.items()
+        ]
+        return sum(losses) / len(MODALITIES)
 
 
-def main():
-    name, threads = sys.argv[1], int(sys.argv[2])
-    torch.set_num_threads(threads)
-    torch.manual_seed(0)
-    width, heads, depth, samples, tokens, repetitions = CASES[name]
-    model = Mget(width, heads, depth)
+def tokens(samples):
+    """Ids that depend on sample, modality and position alone, as on our side."""
     ids = {}
     for index, (m, n, v) in enumerate(MODALITIES):
         p = torch.arange(n)
         ids[m] = torch.stack([(p * 7919 + s * 104729 + index * 1299709) % v for s in range(samples)])
-    first = (tokens - 30) // 2
-    given = {"camera": torch.arange(30), "depth": torch.arange(first), "rgb": torch.arange(tokens - 30 - first)}
-    first = (tokens - 64) // 2
+    return ids
+
+
+def masks(count):
+    """The `count` given and the `count` asked tokens of each sample, as on our side."""
+    first = (count - 30) // 2
+    given = {"camera": torch.arange(30), "depth": torch.arange(first), "rgb": torch.arange(count - 30 - first)}
+    first = (count - 64) // 2
     asked = {
         "body": torch.arange(34),
         "depth": torch.arange(2560, 2560 + first),
         "gaze": torch.arange(30),
-        "rgb": torch.arange(2560, 2560 + tokens - 64 - first),
+        "rgb": torch.arange(2560, 2560 + count - 64 - first),
     }
-    kinds = torch.cat([torch.full((len(p),), i) for i, p in enumerate(asked.values())])
-    mask = (kinds[:, None] == kinds[None, :])[None, None]
+    return given, asked
 
-    def median(work):
-        times = []
-        for _ in range(repetitions + 1):
-            start = time.perf_counter()
-            work()
-            times.append(time.perf_counter() - start)
-        return statistics.median(times[1:])
 
+def run(size, repeats):
+    samples, count = BATCHES[size]
+    model = Mget(size)
+    ids = tokens(samples)
+    given, asked = masks(count)
+
+    @torch.inference_mode()
     def forward():
-        with torch.no_grad():
-            assert math.isfinite(model(given, asked, ids, mask).item())
+        assert math.isfinite(model(given, asked, ids).item())
 
-    forward_seconds = median(forward)
-    optimizer = torch.optim.AdamW(model.parameters(), lr=1e-4, betas=(0.9, 0.95), eps=1e-8, weight_decay=0.05)
+    measure("forward", repeats, forward)
+    optimizer = adamw(model, 1e-4, (0.9, 0.95))
 
     def step():
-        optimizer.zero_grad(set_to_none=False)
-        model(given, asked, ids, mask).backward()
+        optimizer.zero_grad()
+        model(given, asked, ids).backward()
         torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
         optimizer.step()
 
-    print(f"{median(step):.4f} {forward_seconds:.4f}")
-
-
-main()
+    measure("train step", repeats, step)

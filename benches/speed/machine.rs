@@ -1,0 +1,73 @@
+//! What the numbers were measured on and with: the paragraph above the table.
+
+use crate::peer::Engine;
+use crate::table::Results;
+use reviv::run::environment::{Environment, now_text};
+use std::fmt::Write as _;
+use std::path::Path;
+use std::process::Command;
+
+/// The header of the report.
+pub fn header(threads: usize, rounds: usize, all: &[Results], compared: bool) -> String {
+    let environment = Environment::look(Path::new(env!("CARGO_MANIFEST_DIR")));
+    let memory = environment
+        .memory_bytes
+        .map(|bytes| format!(", {:.0} GiB of memory", bytes as f64 / f64::from(1 << 30)))
+        .unwrap_or_default();
+    let system = system().unwrap_or_else(|| environment.system.clone());
+    let revision = environment.git.map(|git| {
+        let short: String = git.revision.chars().take(7).collect();
+        let changed = if git.dirty { " with changes" } else { "" };
+        format!(" ({short}{changed})")
+    });
+    let mut with = format!(
+        "reviv {}{}",
+        environment.reviv,
+        revision.unwrap_or_default()
+    );
+    if let Some(compiler) = compiler() {
+        let _ = write!(with, ", {compiler}");
+    }
+    if let Some(Engine { version, threads }) = all
+        .iter()
+        .find_map(|results| results.theirs.as_ref()?.engine.clone())
+    {
+        let _ = write!(with, "; PyTorch {version}, eager, {threads} threads");
+    }
+    let ratio = if compared {
+        " The ratio is that of the medians: above 1, reviv is faster."
+    } else {
+        ""
+    };
+    format!(
+        "# Speed\n\n\
+         {}, {threads} of {} cores used{memory}; {system}. {with}. {}.\n\n\
+         Seconds are the median and (least..most) of {rounds} rounds, in f32 on the CPU, each in a fresh process after one \
+         call to warm up.{ratio} Memory is the peak of the process.\n",
+        environment.cpu,
+        environment.cores,
+        now_text(),
+    )
+}
+
+/// The name of the operating system and the kind of processor.
+fn system() -> Option<String> {
+    let text = std::fs::read_to_string("/etc/os-release").ok()?;
+    let name = text
+        .lines()
+        .find_map(|line| line.strip_prefix("PRETTY_NAME="))?;
+    Some(format!(
+        "{}, {}",
+        name.trim_matches('"'),
+        std::env::consts::ARCH
+    ))
+}
+
+/// The compiler that Cargo just built this with, where it can be found.
+fn compiler() -> Option<String> {
+    let name = std::env::var_os("RUSTC").unwrap_or_else(|| "rustc".into());
+    let output = Command::new(name).arg("--version").output().ok()?;
+    let text = String::from_utf8(output.stdout).ok()?;
+    let mut words = text.split_whitespace();
+    Some(format!("{} {}", words.next()?, words.next()?))
+}

@@ -1,0 +1,60 @@
+//! What our side does when it is asked: takes times and the peak of memory, and says them as [`Line`]s.
+
+use crate::peer::{Engine, Line, Measured};
+use std::time::Instant;
+
+/// Takes every measurement of one case.
+#[derive(Debug)]
+pub struct Meter {
+    repeats: usize,
+}
+
+impl Meter {
+    pub fn new(repeats: usize) -> Self {
+        Self { repeats }
+    }
+
+    /// Measures `work`, after one call that is not counted.
+    pub fn measure(&self, name: &str, mut work: impl FnMut()) {
+        reset_peak();
+        work();
+        let seconds = (0..self.repeats)
+            .map(|_| {
+                let start = Instant::now();
+                work();
+                start.elapsed().as_secs_f64()
+            })
+            .collect();
+        say(&Line::Measured(Measured {
+            name: name.to_owned(),
+            seconds,
+            memory_mib: peak(),
+        }));
+    }
+}
+
+/// Says what computes.
+pub fn introduce() {
+    say(&Line::Engine(Engine {
+        version: env!("CARGO_PKG_VERSION").to_owned(),
+        threads: rayon::current_num_threads(),
+    }));
+}
+
+fn say(line: &Line) {
+    let text = serde_json::to_string(line).expect("names and numbers are JSON");
+    println!("{text}");
+}
+
+/// Lets the peak begin at what is in use now, where the system can; elsewhere it is that of all work so far.
+fn reset_peak() {
+    let _ = std::fs::write("/proc/self/clear_refs", "5");
+}
+
+/// Peak of resident memory in MiB; `None` where the system does not tell.
+fn peak() -> Option<f64> {
+    let text = std::fs::read_to_string("/proc/self/status").ok()?;
+    let line = text.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
+    let kib: f64 = line.split_whitespace().next()?.parse().ok()?;
+    Some(kib / 1024.0)
+}

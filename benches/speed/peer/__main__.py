@@ -1,0 +1,32 @@
+"""PyTorch's side of `cargo bench --bench speed`: eager, f32, on the CPU, as one would write it by hand.
+
+usage: python benches/speed/peer CASE REPEATS THREADS
+
+Says what `benches/speed/peer.rs` reads: a line of JSON about PyTorch, then one per measurement. Weights are random; shapes,
+passes and arithmetic are those of our side.
+"""
+
+import sys
+
+import torch
+
+import decoding
+import mget
+import tokenizer
+import video
+from measure import say
+
+CASES = {
+    "tokenizer": tokenizer.run,
+    "video": video.run,
+    "mget-tiny": lambda repeats: mget.run("tiny", repeats),
+    "mget-base": lambda repeats: mget.run("base", repeats),
+    "decoding-fast": lambda repeats: decoding.run("fast", repeats),
+    "decoding-paper": lambda repeats: decoding.run("paper", repeats),
+}
+
+case, repeats, threads = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
+torch.set_num_threads(threads)
+torch.manual_seed(0)
+say({"engine": {"version": torch.__version__, "threads": torch.get_num_threads()}})
+CASES[case](repeats)
