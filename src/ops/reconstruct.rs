@@ -42,7 +42,8 @@ pub struct ReconstructSettings {
     pub clip: usize,
     /// A model folder that no stage makes.
     pub model_folder: Option<FilePath>,
-    /// What of the video the model is given: `rgb` is its tokens, and raw video where the model takes it; `pixels` is raw video alone.
+    /// What of the video the model is given: `rgb` is its tokens, and raw video where the model takes it; `pixels` is raw video
+    /// alone. Empty means `rgb`, or `pixels` for a model without tokens of video.
     pub given: Vec<String>,
     /// What is generated; empty means everything but `rgb`.
     pub wanted: Vec<String>,
@@ -69,7 +70,7 @@ impl Default for ReconstructSettings {
             split: "test".to_owned(),
             clip: 0,
             model_folder: None,
-            given: vec!["rgb".to_owned()],
+            given: Vec::new(),
             wanted: Vec::new(),
             decoding: Entry {
                 name: "fast".to_owned(),

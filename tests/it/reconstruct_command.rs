@@ -4,6 +4,7 @@
 use assert_cmd::Command;
 use reviv::decoding::reconstructor::{Binding, TOKENIZERS};
 use reviv::engine::{Compute, Initialise};
+use reviv::masking::PIXELS;
 use reviv::mget::{Mget, MgetSpec, ModalitySpec, Positions, Size};
 use reviv::modality::{self, ClipFormat, Shape};
 use reviv::tokenizer::Tokenizer;
@@ -16,23 +17,27 @@ use std::path::Path;
 
 const SIDE: usize = 32;
 
-/// A whole model folder for 16 frames of 32 x 32 pixels. Nothing in it has been trained.
-fn model_folder(folder: &Path, seed: u64) {
+/// All that a model can know of.
+const ALL: [&str; 7] = [
+    "body",
+    "camera",
+    "depth",
+    "gaze",
+    "left_hand",
+    "rgb",
+    "right_hand",
+];
+
+/// A whole model folder for 16 frames of 32 x 32 pixels, with tokens of `known`, and raw video if `pixels`. Nothing in it has
+/// been trained.
+fn model_folder(folder: &Path, seed: u64, known: &[&str], pixels: bool) {
     let compute = Compute::cpu();
     let format = ClipFormat {
         size: SIDE,
         ..ClipFormat::default()
     };
     let mut modalities = Vec::new();
-    for name in [
-        "body",
-        "camera",
-        "depth",
-        "gaze",
-        "left_hand",
-        "rgb",
-        "right_hand",
-    ] {
+    for &name in known {
         let modality = modality::built_in(name, &format).unwrap();
         let path = folder.join(TOKENIZERS).join(name);
         std::fs::create_dir_all(&path).unwrap();
@@ -84,6 +89,13 @@ fn model_folder(folder: &Path, seed: u64) {
         };
         modalities.push(ModalitySpec::tokens(name, &grid, vocabulary));
     }
+    if pixels {
+        modalities.push(ModalitySpec::pixels(
+            PIXELS,
+            [16, SIDE, SIDE, 3],
+            [4, 16, 16],
+        ));
+    }
     let spec = MgetSpec {
         size: Size {
             width: 24,
@@ -133,7 +145,7 @@ impl Place {
         let place = Self {
             root: tempfile::tempdir().unwrap(),
         };
-        model_folder(&place.path("model"), 1);
+        model_folder(&place.path("model"), 1, &ALL, false);
         place
     }
 
@@ -219,6 +231,16 @@ fn a_video_becomes_a_complete_folder_and_the_same_bytes_again() {
 }
 
 #[test]
+fn a_model_that_has_no_tokens_of_video_is_given_raw_video() {
+    let place = Place::new();
+    std::fs::remove_dir_all(place.path("model")).unwrap();
+    model_folder(&place.path("model"), 1, &["body", "camera", "gaze"], true);
+    pictures(&place.path("walk"), 20, [48, 40], false);
+    place.command("walk", "one").assert().success();
+    assert!(place.path("one").join("camera.tum").is_file());
+}
+
+#[test]
 fn short_still_black_and_portrait_videos_are_reconstructed() {
     let place = Place::new();
     pictures(&place.path("one_frame"), 1, [40, 40], false);
@@ -259,7 +281,7 @@ fn a_model_that_is_none_or_not_whole_is_refused() {
     pictures(&place.path("walk"), 4, [40, 40], false);
     // Weights and tokenizers of two models.
     let other = tempfile::tempdir().unwrap();
-    model_folder(other.path(), 2);
+    model_folder(other.path(), 2, &ALL, false);
     let file = "tokenizers/camera/tokenizer.safetensors";
     let own = std::fs::read(place.path("model").join(file)).unwrap();
     std::fs::copy(other.path().join(file), place.path("model").join(file)).unwrap();

@@ -6,6 +6,7 @@ use crate::clip::Clip;
 use crate::decoding::{Reconstructor, Wish};
 use crate::engine::Compute;
 use crate::experiment::{StageContext, StageError};
+use crate::masking::PIXELS;
 use crate::ops::predict::refused;
 use crate::reconstruction::anchor;
 use crate::reconstruction::folder::{FOLDER, Folder, Setting};
@@ -68,6 +69,12 @@ pub(super) fn run(
     } else {
         settings.wanted.clone()
     };
+    let given = if settings.given.is_empty() {
+        let tokens = reconstructor.names().any(|name| name == "rgb");
+        vec![if tokens { "rgb" } else { PIXELS }.to_owned()]
+    } else {
+        settings.given.clone()
+    };
     let clips = context.inputs("clips").first().cloned();
     let recording = Recording::open(settings, clips.as_ref(), &format)?;
     let list = windows(recording.seconds, settings.overlap)
@@ -108,7 +115,7 @@ pub(super) fn run(
     let mut folder =
         Folder::new(&context.output().join(FOLDER), setting).map_err(StageError::other)?;
     let wish = Wish {
-        given: &settings.given,
+        given: &given,
         wanted: &wanted,
         decoding: &settings.decoding.settings,
         seed: context.seed(),
