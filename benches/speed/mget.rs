@@ -118,6 +118,22 @@ pub fn run(meter: &Meter, size: Size, samples: usize, tokens: usize) {
     measure_step(meter, "train step", model, &batch);
 }
 
+/// A step with all activations kept, and one that computes them again in backward.
+pub fn recompute(meter: &Meter) {
+    let spec = spec(TINY);
+    let batch = batch(&spec, &vec![mask(1024); 8]);
+    measure_step(meter, "train step, all kept", model(&spec), &batch);
+    let mut model = model(&spec);
+    model.start_training();
+    let mut optimizer = AdamW::new(AdamWSettings::default(), &model);
+    meter.measure("train step, recomputed", || {
+        let (_, gradients) = model.recomputed(&batch, Loss::Mod, 1.0);
+        optimizer
+            .step(&mut model, gradients.expect("something is asked for"), 1e-4)
+            .expect("the gradients are finite");
+    });
+}
+
 /// A step on samples as the paper's mixture draws them, which are shorter than the budget, and on as many that fill it, as
 /// padding would.
 pub fn packing(meter: &Meter) {

@@ -20,18 +20,52 @@ impl Gradients {
     /// # Panics
     /// When `loss` does not depend on any tracked parameter.
     pub fn of<M: Parameters + ?Sized>(loss: &Tensor<1>, model: &M) -> Self {
+        let mut gradients = Self::default();
+        let [] = gradients.add(loss, model, []);
+        gradients.complete(model);
+        gradients
+    }
+
+    /// Adds the gradients of `loss` (one element) in those tracked parameters of `model` that it depends on, and gives its
+    /// gradients in `inputs`, tracked arrays that are no parameters. [`Gradients::complete`] must follow the last one.
+    ///
+    /// # Panics
+    /// When `loss` does not depend on anything tracked.
+    pub fn add<M: Parameters + ?Sized, const N: usize>(
+        &mut self,
+        loss: &Tensor<1>,
+        model: &M,
+        inputs: [&Tensor<2>; N],
+    ) -> [Tensor<2>; N] {
         let mut tape = loss.backward();
-        let mut by_name = BTreeMap::new();
         model.visit("", &mut |name, parameter| {
-            if parameter.is_tracked() {
-                let leaf = parameter.flat();
-                let gradient = leaf
-                    .grad_remove(&mut tape)
-                    .unwrap_or_else(|| parameter.untracked().zeros_like());
-                by_name.insert(name.to_owned(), gradient);
+            if !parameter.is_tracked() {
+                return;
+            }
+            let Some(more) = parameter.flat().grad_remove(&mut tape) else {
+                return;
+            };
+            match self.by_name.get_mut(name) {
+                Some(sum) => sum.inplace(|sum| sum + more),
+                None => {
+                    self.by_name.insert(name.to_owned(), more);
+                }
             }
         });
-        Self { by_name }
+        inputs.map(|input| {
+            let gradient = input.grad_remove(&mut tape);
+            gradient.unwrap_or_else(|| input.clone().without_autodiff().zeros_like())
+        })
+    }
+
+    /// Gives every tracked parameter of `model` that has no gradient yet one of zeros.
+    pub fn complete<M: Parameters + ?Sized>(&mut self, model: &M) {
+        model.visit("", &mut |name, parameter| {
+            if parameter.is_tracked() && !self.by_name.contains_key(name) {
+                let zeros = parameter.untracked().zeros_like();
+                self.by_name.insert(name.to_owned(), zeros);
+            }
+        });
     }
 
     /// From flat tensors by name.

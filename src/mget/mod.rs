@@ -2,7 +2,7 @@
 //!
 //! Read in this order: [`size`] and [`spec`] (what a model is made of, and every parameter by name), [`positions`] (the fixed
 //! codes), [`batch`] (packed tokens), [`model`] (**the forward pass, top to bottom**), [`embedding`] (how modalities enter and
-//! leave), [`loss`], [`names`] (the release's names of our parameters).
+//! leave), [`loss`], `recompute` (gradients in little memory), [`names`] (the release's names of our parameters).
 
 pub mod batch;
 mod embedding;
@@ -10,6 +10,7 @@ pub mod loss;
 pub mod model;
 pub mod names;
 pub mod positions;
+mod recompute;
 pub mod size;
 pub mod spec;
 pub mod stored;

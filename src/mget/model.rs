@@ -18,14 +18,14 @@ use crate::nn::{CrossAttention, LayerNorm, Linear, SelfAttention, SwiGlu};
 pub struct Mget {
     spec: MgetSpec,
     mask_token: Parameter,
-    encoder_embeddings: Embeddings,
+    pub(super) encoder_embeddings: Embeddings,
     decoder_embeddings: Heads,
-    encoder: Vec<EncoderBlock>,
-    encoder_norm: LayerNorm,
+    pub(super) encoder: Vec<EncoderBlock>,
+    pub(super) encoder_norm: LayerNorm,
     /// The only matrix with a bias.
-    decoder_proj_context: Linear,
-    decoder: Vec<DecoderBlock>,
-    decoder_norm: LayerNorm,
+    pub(super) decoder_proj_context: Linear,
+    pub(super) decoder: Vec<DecoderBlock>,
+    pub(super) decoder_norm: LayerNorm,
 }
 parameters!(Mget {
     mask_token,
@@ -108,6 +108,11 @@ impl Mget {
     pub fn losses(&self, batch: &Batch, kind: Loss) -> Losses {
         let context = self.encode(&batch.visible);
         let y_MD = self.decode(&context, &batch.targets.sequence);
+        self.losses_of(y_MD, batch, kind)
+    }
+
+    /// The losses of the decoder's answers.
+    pub(super) fn losses_of(&self, y_MD: Option<Tensor<2>>, batch: &Batch, kind: Loss) -> Losses {
         loss::losses(
             &self.spec,
             &self.decoder_embeddings,
@@ -159,12 +164,17 @@ impl Mget {
         let own_modality = Segments::within(&asked.runs);
         let visible = Segments::across(&asked.lengths, &context.lengths);
 
-        let mask_token_1D: Tensor<2> = self.mask_token.reshaped([1, self.spec.size.width]);
-        let mut y_MD = self.encoder_embeddings.place(asked) + mask_token_1D;
+        let mut y_MD = self.questions(asked);
         for block in &self.decoder {
             y_MD = block.forward(y_MD, context.tokens_ND.as_ref(), &own_modality, &visible);
         }
         Some(self.decoder_norm.forward(y_MD))
+    }
+
+    /// What the decoder starts from, `[M, D]`: where it is asked, and nothing else.
+    pub(super) fn questions(&self, asked: &Sequence) -> Tensor<2> {
+        let mask_token_1D: Tensor<2> = self.mask_token.reshaped([1, self.spec.size.width]);
+        self.encoder_embeddings.place(asked) + mask_token_1D
     }
 
     /// The logits of the asked tokens of `modality`, in order: `[its rows, V]`; `None` when it has none.
@@ -176,7 +186,7 @@ impl Mget {
 
 /// `h += Attention(norm1 h)`, then `h += SwiGlu(norm2 h)`.
 #[derive(Debug, Clone)]
-struct EncoderBlock {
+pub(super) struct EncoderBlock {
     norm1: LayerNorm,
     attn: SelfAttention,
     norm2: LayerNorm,
@@ -199,7 +209,7 @@ impl EncoderBlock {
         }
     }
 
-    fn forward(&self, h_ND: Tensor<2>, samples: &Segments) -> Tensor<2> {
+    pub(super) fn forward(&self, h_ND: Tensor<2>, samples: &Segments) -> Tensor<2> {
         let h_ND = h_ND.clone() + self.attn.forward(self.norm1.forward(h_ND), samples);
         h_ND.clone() + self.mlp.forward(self.norm2.forward(h_ND))
     }
@@ -208,7 +218,7 @@ impl EncoderBlock {
 /// `y += Attention(norm1 y)` within modalities, `y += CrossAttention(query_norm y, context_norm context)`, then
 /// `y += SwiGlu(norm2 y)`.
 #[derive(Debug, Clone)]
-struct DecoderBlock {
+pub(super) struct DecoderBlock {
     norm1: LayerNorm,
     self_attn: SelfAttention,
     query_norm: LayerNorm,
@@ -241,7 +251,7 @@ impl DecoderBlock {
         }
     }
 
-    fn forward(
+    pub(super) fn forward(
         &self,
         y_MD: Tensor<2>,
         context_ND: Option<&Tensor<2>>,

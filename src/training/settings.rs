@@ -21,6 +21,8 @@ pub struct TrainingSettings {
     pub batch: usize,
     /// Samples per forward pass; a larger `batch` accumulates gradients. 0 means `batch`.
     pub micro_batch: usize,
+    /// Compute the activations of each block once more in backward instead of keeping them: less memory, more time.
+    pub recompute: bool,
     /// Peak learning rate. The paper: 1e-4 per 256 samples, so 4e-4 at batch 1024.
     pub learning_rate: f64,
     /// Learning rate at the end.
@@ -55,6 +57,7 @@ impl Default for TrainingSettings {
             total_tokens: None,
             batch: 16,
             micro_batch: 0,
+            recompute: false,
             learning_rate: 1e-3,
             final_learning_rate: 0.0,
             warmup: Span::Steps(0),

@@ -18,6 +18,7 @@ pub struct Trainer {
     schedule: Schedule,
     loss: Loss,
     batch: usize,
+    recompute: bool,
     progress: Progress,
 }
 
@@ -84,6 +85,7 @@ impl Trainer {
             schedule,
             loss: settings.loss,
             batch: settings.batch,
+            recompute: settings.recompute,
             progress: Progress::default(),
         }
     }
@@ -110,8 +112,7 @@ impl Trainer {
             progress.input_tokens += batch.visible.sequence.len() as u64;
             progress.target_tokens += batch.targets.sequence.len() as u64;
 
-            let losses = self.model.losses(&batch, self.loss);
-            let values = losses.values();
+            let (values, gradients) = self.gradients(&batch, share);
             if !values.total.is_finite() {
                 return Err(TrainingError::Loss {
                     step: progress.step,
@@ -121,8 +122,7 @@ impl Trainer {
             loss += values.total * share;
             add(&mut modalities, &values);
             // A batch that asks for nothing has no gradient.
-            if let Some(total) = losses.total {
-                let gradients = Gradients::of(&(total * share), &self.model);
+            if let Some(gradients) = gradients {
                 sum = Some(match sum {
                     Some(sum) => sum.plus(gradients),
                     None => gradients,
@@ -143,6 +143,18 @@ impl Trainer {
             gradient_norm,
             progress,
         })
+    }
+
+    /// The losses of a batch, and the gradients of `share` times their total, if it has any.
+    fn gradients(&self, batch: &Batch, share: f64) -> (LossValues, Option<Gradients>) {
+        if self.recompute {
+            return self.model.recomputed(batch, self.loss, share);
+        }
+        let losses = self.model.losses(batch, self.loss);
+        let values = losses.values();
+        let total = losses.total.filter(|_| values.total.is_finite());
+        let gradients = total.map(|total| Gradients::of(&(total * share), &self.model));
+        (values, gradients)
     }
 
     fn zeros(&self) -> Gradients {

@@ -1,0 +1,224 @@
+//! Gradients with the activations of one block at a time: of every block its input is kept, and backward computes the block
+//! once more. More arithmetic, and memory that hardly grows with depth.
+
+use super::batch::{Batch, Sequence, Visible};
+use super::loss::{Loss, LossValues};
+use super::model::Mget;
+use crate::engine::{Gradients, Parameters, Segments, Tensor};
+
+impl Mget {
+    /// The losses of a batch, and the gradients of `share` times their total; `None` when nothing is asked or the total is not
+    /// finite. Equal to [`Mget::losses`] and [`Gradients::of`] up to rounding.
+    #[must_use]
+    pub fn recomputed(
+        &self,
+        batch: &Batch,
+        kind: Loss,
+        share: f64,
+    ) -> (LossValues, Option<Gradients>) {
+        let frozen = self.frozen();
+        let encoder = frozen.encoder_inputs(&batch.visible);
+        let context_ND = encoder.last().map(|h_ND| {
+            let place_ND = frozen.encoder_embeddings.place(&batch.visible.sequence);
+            frozen.context(h_ND.clone(), place_ND)
+        });
+        let decoder = frozen.decoder_inputs(context_ND.as_ref(), batch);
+        drop(frozen);
+
+        // From here on backwards, a part at a time: its input becomes a leaf, and its output is multiplied by the gradient that the
+        // part behind it gave.
+        let mut gradients = Gradients::default();
+        let y_MD = decoder.last().map(leaf);
+        let losses = self.losses_of(
+            y_MD.clone().map(|y_MD| self.decoder_norm.forward(y_MD)),
+            batch,
+            kind,
+        );
+        let values = losses.values();
+        let (Some(y_MD), Some(total)) = (y_MD, losses.total) else {
+            return (values, None);
+        };
+        if !values.total.is_finite() {
+            return (values, None);
+        }
+        let [mut dy_MD] = gradients.add(&(total * share), self, [&y_MD]);
+        drop(y_MD);
+
+        let asked = &batch.targets.sequence;
+        let (own_modality, visible) = decoder_segments(&batch.visible, asked);
+        let mut dcontext_ND: Option<Tensor<2>> = None;
+        for (block, input_MD) in self.decoder.iter().zip(&decoder).rev() {
+            let y_MD = leaf(input_MD);
+            let context_ND = context_ND.as_ref().map(leaf);
+            let out_MD = block.forward(y_MD.clone(), context_ND.as_ref(), &own_modality, &visible);
+            let slope = (out_MD * dy_MD).sum();
+            if let Some(context_ND) = context_ND {
+                let [dy, dcontext] = gradients.add(&slope, self, [&y_MD, &context_ND]);
+                dy_MD = dy;
+                dcontext_ND = Some(match dcontext_ND {
+                    Some(sum) => sum + dcontext,
+                    None => dcontext,
+                });
+            } else {
+                [dy_MD] = gradients.add(&slope, self, [&y_MD]);
+            }
+        }
+        let [] = gradients.add(&(self.questions(asked) * dy_MD).sum(), self, []);
+
+        if let (Some(dcontext_ND), Some(h_ND)) = (dcontext_ND, encoder.last().map(leaf)) {
+            let place_ND = self.encoder_embeddings.place(&batch.visible.sequence);
+            let context_ND = self.context(h_ND.clone(), place_ND);
+            let [mut dh_ND] = gradients.add(&(context_ND * dcontext_ND).sum(), self, [&h_ND]);
+            let samples = Segments::within(&batch.visible.sequence.lengths);
+            for (block, input_ND) in self.encoder.iter().zip(&encoder).rev() {
+                let h_ND = leaf(input_ND);
+                let out_ND = block.forward(h_ND.clone(), &samples);
+                [dh_ND] = gradients.add(&(out_ND * dh_ND).sum(), self, [&h_ND]);
+            }
+            let [] = gradients.add(&(self.seen(&batch.visible) * dh_ND).sum(), self, []);
+        }
+        gradients.complete(self);
+        (values, Some(gradients))
+    }
+
+    /// What the encoder starts from.
+    fn seen(&self, visible: &Visible) -> Tensor<2> {
+        self.encoder_embeddings.content(visible) + self.encoder_embeddings.place(&visible.sequence)
+    }
+
+    fn context(&self, h_ND: Tensor<2>, place_ND: Tensor<2>) -> Tensor<2> {
+        let h_ND = self.encoder_norm.forward(h_ND);
+        self.decoder_proj_context.forward(h_ND) + place_ND
+    }
+
+    /// The input of every block of the encoder, and the output of the last; nothing when nothing is visible.
+    fn encoder_inputs(&self, visible: &Visible) -> Vec<Tensor<2>> {
+        if visible.sequence.is_empty() {
+            return Vec::new();
+        }
+        let samples = Segments::within(&visible.sequence.lengths);
+        let mut inputs = vec![self.seen(visible)];
+        for (place, block) in self.encoder.iter().enumerate() {
+            inputs.push(block.forward(inputs[place].clone(), &samples));
+        }
+        inputs
+    }
+
+    /// The input of every block of the decoder, and the output of the last; nothing when nothing is asked.
+    fn decoder_inputs(&self, context_ND: Option<&Tensor<2>>, batch: &Batch) -> Vec<Tensor<2>> {
+        let asked = &batch.targets.sequence;
+        if asked.is_empty() {
+            return Vec::new();
+        }
+        let (own_modality, visible) = decoder_segments(&batch.visible, asked);
+        let mut inputs = vec![self.questions(asked)];
+        for (place, block) in self.decoder.iter().enumerate() {
+            let y_MD = inputs[place].clone();
+            inputs.push(block.forward(y_MD, context_ND, &own_modality, &visible));
+        }
+        inputs
+    }
+}
+
+/// Who attends to whom, as in [`Mget::decode`]: own modality, and all that is visible of the sample.
+fn decoder_segments(visible: &Visible, asked: &Sequence) -> (Segments, Segments) {
+    (
+        Segments::within(&asked.runs),
+        Segments::across(&asked.lengths, &visible.sequence.lengths),
+    )
+}
+
+/// A value whose gradient is asked for.
+fn leaf(value: &Tensor<2>) -> Tensor<2> {
+    value.clone().autodiff().require_grad()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::{Content, MgetSpec, ModalitySpec, Positions, Size};
+    use super::*;
+    use crate::engine::parameters::to_host;
+    use crate::engine::{Compute, Initialise};
+    use crate::masking::Mask;
+
+    fn spec() -> MgetSpec {
+        MgetSpec {
+            size: Size {
+                width: 24,
+                heads: 2,
+                encoder_depth: 2,
+                decoder_depth: 3,
+                hidden: 0,
+            },
+            positions: Positions::Released,
+            modalities: vec![
+                ModalitySpec::tokens("camera", &[4], 10),
+                ModalitySpec::tokens("gaze", &[4], 7),
+                ModalitySpec::pixels("pixels", [2, 4, 4, 1], [1, 2, 2]),
+            ],
+        }
+    }
+
+    fn batch(inputs: [[&[u32]; 3]; 2], targets: [[&[u32]; 3]; 2]) -> Batch {
+        let clip: Vec<f32> = (0..32_u8).map(|i| f32::from(i) / 32.0).collect();
+        let sample = || {
+            vec![
+                Content::Ids(&[1, 2, 3, 4]),
+                Content::Ids(&[5, 6, 0, 1]),
+                Content::Floats(&clip),
+            ]
+        };
+        let masks: Vec<Mask> = inputs
+            .iter()
+            .zip(targets)
+            .map(|(input, target)| Mask {
+                input: input.map(<[u32]>::to_vec).to_vec(),
+                target: target.map(<[u32]>::to_vec).to_vec(),
+            })
+            .collect();
+        Batch::new(&spec(), &[sample(), sample()], &masks).unwrap()
+    }
+
+    fn model() -> Mget {
+        let compute = Compute::cpu();
+        let mut model = Mget::new(&spec(), &Initialise::new(&compute, 3)).unwrap();
+        model.start_training();
+        model
+    }
+
+    #[test]
+    fn recomputed_gradients_are_those_of_the_whole_graph() {
+        let nothing: [&[u32]; 3] = [&[], &[], &[]];
+        let cases = [
+            batch(
+                [[&[0, 2], &[1], &[0, 5]], [&[], &[3], &[]]],
+                [[&[1], &[0, 2], &[]], [&[0, 1, 2], &[], &[]]],
+            ),
+            batch([nothing, nothing], [[&[1], &[0], &[]], nothing]),
+        ];
+        let model = model();
+        for batch in cases {
+            let whole = model.losses(&batch, Loss::Mod);
+            let expected = Gradients::of(&(whole.total.clone().unwrap() * 0.5), &model);
+            let (values, found) = model.recomputed(&batch, Loss::Mod, 0.5);
+            let found = found.unwrap();
+            assert_eq!(values, whole.values());
+            assert_eq!(found.iter().count(), expected.iter().count());
+            for (name, gradient) in expected.iter() {
+                let other = to_host(found.get(name).unwrap().clone());
+                for (a, b) in to_host(gradient.clone()).into_iter().zip(other) {
+                    assert!((a - b).abs() < 1e-6 + 1e-5 * a.abs(), "{name}: {a} {b}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_batch_that_asks_for_nothing_has_no_gradient() {
+        let nothing: [&[u32]; 3] = [&[], &[], &[]];
+        let batch = batch([[&[0], &[], &[]], nothing], [nothing, nothing]);
+        let (values, gradients) = model().recomputed(&batch, Loss::Mod, 1.0);
+        assert_eq!(values.total, 0.0);
+        assert!(gradients.is_none());
+    }
+}
