@@ -49,7 +49,7 @@ impl Op for Clips {
     }
 
     fn version(&self) -> u32 {
-        2
+        3
     }
 
     fn about(&self) -> &'static str {

@@ -260,22 +260,24 @@ impl Motion {
         if excess(free) <= 0.0 {
             return free;
         }
-        let mut low = free;
+        // The nearest that reaches, more or less lifted; a foot too far for any keeps its lift.
         for i in 1..=24 {
-            let high = free + 0.05 * f64::from(i);
-            if excess(high) <= 0.0 {
-                let mut high = high;
+            for way in [0.05, -0.05] {
+                let [near, far] = [i - 1, i].map(|i| free + way * f64::from(i));
+                if far < 0.0 || excess(far) > 0.0 {
+                    continue;
+                }
+                let (mut short, mut enough) = (near, far);
                 for _ in 0..20 {
-                    let middle = f64::midpoint(low, high);
+                    let middle = f64::midpoint(short, enough);
                     if excess(middle) <= 0.0 {
-                        high = middle;
+                        enough = middle;
                     } else {
-                        low = middle;
+                        short = middle;
                     }
                 }
-                return high;
+                return enough;
             }
-            low = high;
         }
         free
     }

@@ -228,14 +228,17 @@ pub fn body(
         let hips = trunk.T_world_pelvis.rotation * Vector3::x();
         let out = trunk.T_world_pelvis.rotation * Vector3::new(0.0, 0.15 * sign(side), 0.0);
         let pole = forward + hips + out;
-        two_bones(&trunk.hips[side], &ankle, wearer.thigh, wearer.shin, &pole)
+        let hip = &trunk.hips[side];
+        let (knee, reached) = two_bones(hip, &ankle, wearer.thigh, wearer.shin, &pole);
+        // The foot is rigid: where the leg is too short, it comes along.
+        (knee, reached, toe + (reached - ankle))
     };
     let (arms, legs) = ([arm(LEFT), arm(RIGHT)], [leg(LEFT), leg(RIGHT)]);
     BodyPose {
         trunk: *trunk,
         knees: legs.map(|l| l.0),
         ankles: legs.map(|l| l.1),
-        toes: [LEFT, RIGHT].map(|side| feet[side].0),
+        toes: legs.map(|l| l.2),
         elbows: arms.map(|a| a.0),
         wrists: arms.map(|a| a.1),
     }
