@@ -98,7 +98,7 @@ impl Op for Predict {
     }
 
     fn version(&self) -> u32 {
-        2
+        3
     }
 
     fn about(&self) -> &'static str {

@@ -97,7 +97,7 @@ impl Op for Reconstruct {
     }
 
     fn version(&self) -> u32 {
-        2
+        3
     }
 
     fn about(&self) -> &'static str {

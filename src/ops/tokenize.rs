@@ -65,7 +65,7 @@ impl Op for Tokenize {
     }
 
     fn version(&self) -> u32 {
-        1
+        2
     }
 
     fn about(&self) -> &'static str {

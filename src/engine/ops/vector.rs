@@ -13,14 +13,13 @@ pub fn vectorised<R>(body: impl FnOnce() -> R) -> R {
     pulp::Arch::new().dispatch(body)
 }
 
-/// The sum of `term(i-th values of the arrays)`.
+/// The sum of `term(i-th values of the arrays)`, over what the arrays have in common.
 #[inline(always)]
 fn reduce<const N: usize>(arrays: [&[f32]; N], term: impl Fn([f32; N]) -> f32) -> f32 {
+    let length = arrays.iter().map(|array| array.len()).min().unwrap_or(0);
+    let (whole, rest) = (length / LANES, length % LANES);
     // Chunks of a known length: an index that has to be checked keeps a loop from becoming vector instructions.
-    let arrays = arrays.map(<[f32]>::as_chunks::<LANES>);
-    let whole = arrays.iter().map(|(chunks, _)| chunks.len()).min();
-    let rest = arrays.iter().map(|(_, rest)| rest.len()).min();
-    let (whole, rest) = (whole.unwrap_or(0), rest.unwrap_or(0));
+    let arrays = arrays.map(|array| array[..length].as_chunks::<LANES>());
     let chunks = arrays.map(|(chunks, _)| &chunks[..whole]);
     let rests = arrays.map(|(_, values)| &values[..rest]);
     let mut lanes = [0.0_f32; LANES];
@@ -57,8 +56,7 @@ pub fn sum_of_exp(x: &[f32], top: f32) -> f32 {
 /// The inner product; of the shorter length if they differ.
 #[inline(always)]
 pub fn dot(a: &[f32], b: &[f32]) -> f32 {
-    let length = a.len().min(b.len());
-    reduce([&a[..length], &b[..length]], |[a, b]| a * b)
+    reduce([a, b], |[a, b]| a * b)
 }
 
 /// The largest value; negative infinity of none.

@@ -1,9 +1,12 @@
 //! Attention over segments, from packed projections, without permuted copies and without stored probabilities.
 //!
-//! Forward works on blocks of queries and keeps the logarithm of each row's normaliser; backward recomputes the probabilities
-//! of one block at a time. One task is a block of one head (forward) or all segments that share keys, of one head (backward).
+//! Scores exist one tile at a time, some queries by some keys, however long the rows are. Forward carries each row's largest
+//! score and sum from tile to tile and keeps the logarithm of its normaliser, from which backward recomputes the
+//! probabilities of a tile. One task is a block of queries of one head (forward) or all segments that share keys, of one head
+//! (backward).
 #![allow(unsafe_code)]
 
+use std::ops::Range;
 use std::sync::Arc;
 
 use rayon::prelude::*;
@@ -12,8 +15,9 @@ use super::super::super::{Segment, Segments};
 use super::super::gemm::{Matrix, Shared, Threads, gemm, gemm_into};
 use super::{Array, Kernel, Saved, vector};
 
-/// Scores of one block: what fits into the second-level cache with the keys and values beside it.
-const BLOCK_SCORES: usize = 96 * 1024;
+/// Queries and keys of one tile: its scores fit into the second-level cache with the keys and values beside them.
+const TILE_QUERIES: usize = 128;
+const TILE_KEYS: usize = 768;
 
 #[derive(Debug)]
 pub struct Attention<'a> {
@@ -61,21 +65,18 @@ impl<'a> Layout<'a> {
         )
     }
 
-    fn keys(&self, segment: &Segment, head: usize) -> Matrix<'a> {
-        let start = segment.keys.start * self.kv_stride + self.key_start + head * self.head;
-        Matrix::strided(
-            &self.kv[start..],
-            segment.keys.len(),
-            self.head,
-            self.kv_stride,
-        )
+    fn keys(&self, rows: &Range<usize>, head: usize) -> Matrix<'a> {
+        self.keys_or_values(rows, self.key_start + head * self.head)
     }
 
-    fn values(&self, segment: &Segment, head: usize) -> Matrix<'a> {
-        let start = segment.keys.start * self.kv_stride + self.value_start + head * self.head;
+    fn values(&self, rows: &Range<usize>, head: usize) -> Matrix<'a> {
+        self.keys_or_values(rows, self.value_start + head * self.head)
+    }
+
+    fn keys_or_values(&self, rows: &Range<usize>, column: usize) -> Matrix<'a> {
         Matrix::strided(
-            &self.kv[start..],
-            segment.keys.len(),
+            &self.kv[rows.start * self.kv_stride + column..],
+            rows.len(),
             self.head,
             self.kv_stride,
         )
@@ -92,19 +93,13 @@ impl<'a> Layout<'a> {
     }
 }
 
-/// Queries per block for so many keys.
-fn block_rows(keys: usize) -> usize {
-    (BLOCK_SCORES / keys.max(1)).clamp(16, 256) / 16 * 16
-}
-
-/// `(first row, rows)` of the blocks of a segment's queries.
-fn blocks(segment: &Segment) -> impl Iterator<Item = (usize, usize)> + use<> {
-    let (end, step) = (segment.queries.end, block_rows(segment.keys.len()));
-    segment
-        .queries
+/// `range` in pieces of `step`; the last may be shorter.
+fn tiles(range: &Range<usize>, step: usize) -> impl Iterator<Item = Range<usize>> + use<> {
+    let end = range.end;
+    range
         .clone()
         .step_by(step)
-        .map(move |row| (row, step.min(end - row)))
+        .map(move |start| start..end.min(start + step))
 }
 
 /// Segments whose keys overlap, together: their gradients in keys and values add up.
@@ -134,46 +129,38 @@ impl Kernel for Attention<'_> {
         let rows = self.segments.queries();
         let mut output = vec![0.0; rows * layout.width];
         let mut normalisers = vec![0.0; rows * self.heads];
-        let tasks: Vec<(&Segment, usize, usize, usize)> = self
+        let tasks: Vec<(&Segment, Range<usize>, usize)> = self
             .segments
             .list()
             .iter()
             .filter(|segment| !segment.keys.is_empty())
             .flat_map(|segment| {
-                blocks(segment).flat_map(move |(row, rows)| {
-                    (0..self.heads).map(move |head| (segment, row, rows, head))
+                tiles(&segment.queries, TILE_QUERIES).flat_map(move |block| {
+                    (0..self.heads).map(move |head| (segment, block.clone(), head))
                 })
             })
             .collect();
         let (out, logs) = (Shared::new(&mut output), Shared::new(&mut normalisers));
         tasks.into_par_iter().for_each_init(
-            Vec::new,
-            |scores: &mut Vec<f32>, (segment, row, count, head)| {
-                let keys = segment.keys.len();
-                scores.resize(count * keys, 0.0);
-                gemm_scores(
-                    scores,
-                    layout.queries(row, count, head),
-                    layout.keys(segment, head),
-                    layout.scale,
-                );
-                // SAFETY: query rows are in one segment and one block only, and heads have columns of their own.
-                let logs = unsafe { logs.part(head * rows + row, count) };
-                softmax(scores, keys, logs);
-                let start = row * layout.width + head * layout.head;
-                let p = Matrix::rows(scores, count, keys);
-                // SAFETY: as above.
-                unsafe {
-                    out.gemm(
-                        start,
-                        layout.width,
-                        p,
-                        layout.values(segment, head),
-                        1.0,
-                        false,
-                        Threads::One,
-                    );
-                };
+            RunningSoftmax::default,
+            |running, (segment, block, head)| {
+                let queries = layout.queries(block.start, block.len(), head);
+                running.start(block.len(), layout.head);
+                for keys in tiles(&segment.keys, TILE_KEYS) {
+                    let (k, v) = (layout.keys(&keys, head), layout.values(&keys, head));
+                    running.add(queries, k, v, layout.scale);
+                }
+                for (i, row) in block.enumerate() {
+                    let start = row * layout.width + head * layout.head;
+                    // SAFETY: query rows are in one segment and one block only, and heads have columns of their own.
+                    let (out, log) = unsafe {
+                        (
+                            out.part(start, layout.head),
+                            logs.part(head * rows + row, 1),
+                        )
+                    };
+                    log[0] = running.finish(i, out);
+                }
             },
         );
         let output = Array::new(output, &[rows, layout.width]);
@@ -212,12 +199,14 @@ impl Kernel for Attention<'_> {
             scratch,
             |(p, dp): &mut (Vec<f32>, Vec<f32>), (group, head)| {
                 for segment in group {
-                    let keys = segment.keys.len();
-                    let (k, v) = (layout.keys(segment, head), layout.values(segment, head));
-                    let first = segment.keys.start * layout.kv_stride + head * layout.head;
-                    for (row, count) in blocks(segment) {
-                        p.resize(count * keys, 0.0);
-                        dp.resize(count * keys, 0.0);
+                    let blocks = tiles(&segment.queries, TILE_QUERIES).flat_map(|block| {
+                        tiles(&segment.keys, TILE_KEYS).map(move |keys| (block.clone(), keys))
+                    });
+                    for (block, keys) in blocks {
+                        let (row, count) = (block.start, block.len());
+                        p.resize(count * keys.len(), 0.0);
+                        dp.resize(count * keys.len(), 0.0);
+                        let (k, v) = (layout.keys(&keys, head), layout.values(&keys, head));
                         let queries = layout.queries(row, count, head);
                         let d = layout.own(dy.values(), row, count, head);
                         gemm_scores(p, queries, k, layout.scale);
@@ -227,7 +216,7 @@ impl Kernel for Attention<'_> {
                         softmax_backward(
                             p,
                             dp,
-                            keys,
+                            keys.len(),
                             logs,
                             layout.scale,
                             #[inline(always)]
@@ -237,33 +226,32 @@ impl Kernel for Attention<'_> {
                                 vector::dot(&dy.values()[own.clone()], &output[own])
                             },
                         );
-                        let (p, dp) = (Matrix::rows(p, count, keys), Matrix::rows(dp, count, keys));
+                        let p = Matrix::rows(p, count, keys.len());
+                        let dp = Matrix::rows(dp, count, keys.len());
                         let stride = layout.kv_stride;
+                        let first = keys.start * stride + head * layout.head;
+                        let place = row * layout.q_stride + head * layout.head;
                         // SAFETY: this task alone writes the columns of its head, in the rows of its group: groups have no key in
                         // common, query rows are in one segment only, and queries, keys and values have columns of their own.
                         unsafe {
-                            let place = first + layout.value_start;
-                            dkv_place.gemm(
-                                place,
+                            let add = |to: Shared<'_>, place, stride, a, b| {
+                                to.gemm(place, stride, a, b, 1.0, true, Threads::One);
+                            };
+                            add(
+                                dkv_place,
+                                first + layout.value_start,
                                 stride,
                                 p.transposed(),
                                 d,
-                                1.0,
-                                true,
-                                Threads::One,
                             );
-                            let place = first + layout.key_start;
-                            dkv_place.gemm(
-                                place,
+                            add(
+                                dkv_place,
+                                first + layout.key_start,
                                 stride,
                                 dp.transposed(),
                                 queries,
-                                1.0,
-                                true,
-                                Threads::One,
                             );
-                            let place = row * layout.q_stride + head * layout.head;
-                            dq_place.gemm(place, layout.q_stride, dp, k, 1.0, false, Threads::One);
+                            add(dq_place, place, layout.q_stride, dp, k);
                         }
                     }
                 }
@@ -280,25 +268,76 @@ fn gemm_scores(scores: &mut [f32], queries: Matrix<'_>, keys: Matrix<'_>, scale:
     gemm_into(scores, columns, queries, keys, scale, false, Threads::One);
 }
 
-/// Rows of scores to probabilities, in place; the log normaliser of each into `logs`.
-fn softmax(scores: &mut [f32], keys: usize, logs: &mut [f32]) {
-    vector::vectorised(
-        #[inline(always)]
-        || {
-            for (row, log) in scores.chunks_exact_mut(keys).zip(logs) {
-                let top = vector::largest(row);
-                for value in row.iter_mut() {
-                    *value = vector::exp(*value - top);
+/// Attention of a block of queries over keys that come a tile at a time.
+#[derive(Default)]
+struct RunningSoftmax {
+    /// Of the tile, `[rows, its keys]`.
+    scores: Vec<f32>,
+    /// Per row, over the tiles so far: the largest score, and the sum of the exponentials of scores less the largest.
+    tops: Vec<f32>,
+    sums: Vec<f32>,
+    /// Values weighted by the same exponentials, `[rows, head]`.
+    weighted: Vec<f32>,
+    head: usize,
+}
+
+impl RunningSoftmax {
+    fn start(&mut self, rows: usize, head: usize) {
+        self.head = head;
+        for (array, length, value) in [
+            (&mut self.tops, rows, f32::NEG_INFINITY),
+            (&mut self.sums, rows, 0.0),
+            (&mut self.weighted, rows * head, 0.0),
+        ] {
+            array.clear();
+            array.resize(length, value);
+        }
+    }
+
+    fn add(&mut self, queries: Matrix<'_>, keys: Matrix<'_>, values: Matrix<'_>, scale: f32) {
+        let (rows, columns) = (self.tops.len(), keys.transposed().columns());
+        self.scores.resize(rows * columns, 0.0);
+        gemm_scores(&mut self.scores, queries, keys, scale);
+        vector::vectorised(
+            #[inline(always)]
+            || {
+                let state = self.tops.iter_mut().zip(&mut self.sums);
+                let weighted = self.weighted.chunks_exact_mut(self.head);
+                let scores = self.scores.chunks_exact_mut(columns);
+                for ((row, (top, sum)), weighted) in scores.zip(state).zip(weighted) {
+                    let higher = vector::largest(row).max(*top);
+                    let before = vector::exp(*top - higher);
+                    for value in row.iter_mut() {
+                        *value = vector::exp(*value - higher);
+                    }
+                    for value in weighted {
+                        *value *= before;
+                    }
+                    *sum = *sum * before + vector::sum(row);
+                    *top = higher;
                 }
-                let sum = vector::sum(row);
-                let scale = 1.0 / sum;
-                for value in row.iter_mut() {
-                    *value *= scale;
-                }
-                *log = top + sum.ln();
-            }
-        },
-    );
+            },
+        );
+        let p = Matrix::rows(&self.scores, rows, columns);
+        gemm_into(
+            &mut self.weighted,
+            self.head,
+            p,
+            values,
+            1.0,
+            true,
+            Threads::One,
+        );
+    }
+
+    /// Writes what row `i` attends to, and gives the logarithm of its normaliser.
+    fn finish(&self, i: usize, out: &mut [f32]) -> f32 {
+        let scale = 1.0 / self.sums[i];
+        for (out, value) in out.iter_mut().zip(&self.weighted[i * self.head..]) {
+            *out = value * scale;
+        }
+        self.tops[i] + self.sums[i].ln()
+    }
 }
 
 /// Scores in `p` to probabilities, and gradients of probabilities in `dp` to gradients of unscaled scores, in place.
