@@ -125,7 +125,7 @@ impl Op for TrainTokenizer {
     }
 
     fn version(&self) -> u32 {
-        2
+        3
     }
 
     fn about(&self) -> &'static str {

@@ -3,13 +3,16 @@
 //! * Every wavelet coefficient of the output has its own deviation as its unit. They differ by a factor of a hundred, and an
 //!   optimizer moves all of them equally far: the noise of many small ones would hide the few that make the picture.
 //! * The decoder starts at the mean of the clips, not at noise larger than they are.
-//! * Residual branches start quiet: twenty random ones in a row blur every token over its neighbours, and hide it.
+//! * A token starts as a matter of its own block: residual branches start quiet, and the convolutions without a shortcut start
+//!   at their centre. Twenty random kernels in a row blur every token over its neighbours, and hide it.
 //! * The latents are white and as wide as the levels, so that all tokens are in use from the start.
+
+use burn::tensor::Tensor;
 
 use super::VideoTokenizer;
 use crate::clip::Signal;
 use crate::engine::parameters::to_host;
-use crate::engine::{Parameters, Weights};
+use crate::engine::{Parameters, Values, Weights};
 use crate::tokenizer::TokenizerError;
 use crate::tokenizer::normaliser::Normaliser;
 use crate::tokenizer::whitening::{Whitening, floats, scale};
@@ -17,7 +20,7 @@ use crate::tokenizer::whitening::{Whitening, floats, scale};
 /// Deviation of the latents: `tanh` spreads them evenly over the levels.
 const SPREAD: f64 = 0.9;
 
-/// What the ends of residual branches are multiplied by.
+/// What the ends of residual branches, and taps beside the centre, are multiplied by.
 const QUIET: f32 = 0.1;
 
 /// Units of coefficients are at least this share of the largest.
@@ -40,8 +43,10 @@ impl VideoTokenizer {
         self.standardise(coefficients.statistics()?)?;
         let mut weights = self.network().weights();
         scale(&mut weights, QUIET, |name| {
-            name.contains(".conv2.1.") || name.contains(".proj_out.")
+            let branches = [".conv2.1.", ".proj_out.", "sample.conv1.", "sample.conv2."];
+            branches.iter().any(|branch| name.contains(branch))
         });
+        centre(&mut weights);
         self.load(&weights)?;
         let mut latents = Whitening::new(self.settings().levels.len());
         for clip in &values {
@@ -60,6 +65,41 @@ impl VideoTokenizer {
         self.network_mut()
             .load(weights)
             .map_err(|error| TokenizerError::Other(error.to_string()))
+    }
+}
+
+/// The squared distance of the mean and covariance of latents `[rows, width]` from those they start with, `[1]`. Left alone,
+/// they drift to where `tanh` is flat, and a few codes take all tokens.
+pub(super) fn unevenness(z: Tensor<2>) -> Tensor<1> {
+    let [rows, width] = z.dims();
+    let mean = z.clone().mean_dim(0);
+    let centred = z - mean.clone();
+    let covariance = centred.clone().transpose().matmul(centred) / rows as f64;
+    let white = Tensor::<2>::eye(width, &mean.device()) * (SPREAD * SPREAD);
+    (covariance - white).square().sum() + mean.square().sum()
+}
+
+/// Makes the first and last convolutions of encoder and decoder look mostly at the pixel itself, with the variance they had.
+fn centre(weights: &mut Weights) {
+    for (name, tensor) in &mut weights.tensors {
+        let place = name.contains(".conv_in.") || name.contains(".conv_out.");
+        let (&[_, _, time, height, width], Values::F32(values)) =
+            (tensor.shape.as_slice(), &mut tensor.values)
+        else {
+            continue;
+        };
+        if !place {
+            continue;
+        }
+        let taps = time * height * width;
+        // In time the last tap is the present.
+        let own = if time > 1 { taps - 1 } else { taps / 2 };
+        let loud = (taps as f32).sqrt();
+        for kernel in values.chunks_exact_mut(taps) {
+            for (tap, value) in kernel.iter_mut().enumerate() {
+                *value *= if tap == own { loud } else { QUIET };
+            }
+        }
     }
 }
 
@@ -104,5 +144,83 @@ impl Moments {
                 .map(|deviation| deviation.max(LEAST * most) as f32)
                 .collect(),
         )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::engine::{Compute, Initialise};
+    use crate::tokenizer::video::{Network, VideoSettings};
+    use burn::tensor::TensorData;
+    use ndarray::{ArrayD, IxDyn};
+
+    fn noise(seed: usize) -> Signal {
+        let values = ArrayD::from_shape_fn(IxDyn(&[5, 32, 32, 3]), |at| {
+            let cell = at[1] / 8 + 5 * (at[2] / 8) + 25 * (at[0].div_ceil(4)) + 100 * seed;
+            ((cell * 7919 + at[3] * 104_729) % 1000) as f32 / 500.0 - 1.0
+        });
+        Signal {
+            values,
+            valid: None,
+        }
+    }
+
+    #[test]
+    fn a_token_starts_as_a_matter_of_its_own_block() {
+        let settings = VideoSettings {
+            channels: 16,
+            multipliers: vec![1, 2],
+            blocks: 1,
+            latent_channels: 8,
+            levels: vec![8, 5, 5],
+            ..VideoSettings::default()
+        };
+        let compute = Compute::cpu();
+        let network = Network::new(&Initialise::new(&compute, 4), &settings).unwrap();
+        let mut tokenizer = VideoTokenizer::new("rgb", [5, 32, 32], network, &compute).unwrap();
+        let clips: Vec<Signal> = (0..4).map(noise).collect();
+        tokenizer.calibrate(&clips).unwrap();
+
+        let latents = |clip: &Signal| {
+            let values: Vec<f32> = clip.values.iter().copied().collect();
+            to_host(tokenizer.latents(tokenizer.blocks(&[&values]), 1))
+        };
+        let mut changed = clips[0].clone();
+        changed
+            .values
+            .slice_mut(ndarray::s![1.., 8..16, 8..16, ..])
+            .mapv_inplace(|value| -value);
+        let (before, after) = (latents(&clips[0]), latents(&changed));
+        let change: Vec<f32> = before
+            .chunks(3)
+            .zip(after.chunks(3))
+            .map(|(a, b)| a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f32>())
+            .map(f32::sqrt)
+            .collect();
+        // [3, 4, 4] tokens; the block is the second in both directions, and the third group repeats the last frame.
+        let own = [16 + 4 + 1, 32 + 4 + 1];
+        for (token, other) in change.iter().enumerate() {
+            assert!(
+                own.contains(&token) || 2.0 * other < change[own[0]],
+                "{change:?}"
+            );
+        }
+    }
+
+    #[test]
+    fn only_white_latents_of_the_right_width_are_even() {
+        let compute = Compute::cpu();
+        let of = |rows: [[f64; 2]; 4]| {
+            let values: Vec<f32> = rows.iter().flatten().map(|v| *v as f32).collect();
+            let z = Tensor::<2>::from_data(TensorData::new(values, [4, 2]), compute.device());
+            unevenness(z).into_scalar::<f32>()
+        };
+        let s = SPREAD;
+        assert!(of([[s, s], [s, -s], [-s, s], [-s, -s]]) < 1e-9);
+        let moved = of([[s + 1.0, s], [s + 1.0, -s], [1.0 - s, s], [1.0 - s, -s]]);
+        assert!((moved - 1.0).abs() < 1e-5, "{moved}");
+        let alike = of([[s, s], [s, s], [-s, -s], [-s, -s]]);
+        assert!((f64::from(alike) - 2.0 * s.powi(4)).abs() < 1e-5, "{alike}");
     }
 }

@@ -3,6 +3,7 @@
 use burn::tensor::{Device, Tensor, TensorData};
 use ndarray::{ArrayD, IxDyn};
 
+use super::calibrate::unevenness;
 use super::layers::Extent;
 use super::maps::{Map, maps};
 use super::padding::Padding;
@@ -31,6 +32,8 @@ pub struct VideoTokenizer {
 pub struct Trained {
     /// Mean squared error of all pixels, `[1]`: what to minimise.
     pub loss: Tensor<1>,
+    /// How far the latents are from those that use all codes evenly, `[1]`.
+    pub unevenness: Tensor<1>,
     /// The tokens the batch went through.
     pub tokens: Vec<u32>,
 }
@@ -180,7 +183,9 @@ impl VideoTokenizer {
         let samples = clips.len();
         let slices: Vec<&[f32]> = values.iter().map(Vec::as_slice).collect();
         let blocks = self.blocks(&slices);
-        let bounded = self.bound(self.latents(blocks.clone(), samples));
+        let latents = self.latents(blocks.clone(), samples);
+        let unevenness = unevenness(latents.clone());
+        let bounded = self.bound(latents);
         let host = to_host(bounded.clone());
         let tokens = self.fsq.index(&host);
         let width = self.fsq.width();
@@ -195,7 +200,11 @@ impl VideoTokenizer {
         let kept = self.kept(samples);
         let count = kept.clone().sum().into_scalar::<f32>() as f64;
         let loss = ((found - blocks).square() * kept).sum() / count;
-        Ok(Trained { loss, tokens })
+        Ok(Trained {
+            loss,
+            unevenness,
+            tokens,
+        })
     }
 
     /// `[1, width]` of a function of each dimension's levels.
