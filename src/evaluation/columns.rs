@@ -10,6 +10,17 @@ pub enum Better {
     Higher,
 }
 
+impl Better {
+    /// 1 or -1: what values are multiplied by so that lower is better.
+    #[must_use]
+    pub fn sign(self) -> f64 {
+        match self {
+            Self::Lower => 1.0,
+            Self::Higher => -1.0,
+        }
+    }
+}
+
 /// A metric as a column of scores and tables.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Column {

@@ -62,10 +62,7 @@ impl Table {
     /// compete, published rows do not; without an interval nothing is bold.
     pub fn mark_best(&mut self) {
         for position in 0..self.columns.len() {
-            let sign = match self.columns[position].better {
-                Better::Lower => 1.0,
-                Better::Higher => -1.0,
-            };
+            let sign = self.columns[position].better.sign();
             let mut ranked: Vec<(f64, usize)> = self
                 .rows
                 .iter()
@@ -77,11 +74,8 @@ impl Table {
             let &[(_, best), (_, second), ..] = ranked.as_slice() else {
                 continue;
             };
-            let worst_of_best = self.edge(best, position, sign, 1.0);
-            let best_of_second = self
-                .edge(second, position, sign, -1.0)
-                .or(self.rows[second].cells[position].value.map(|v| sign * v));
-            let clears = matches!((worst_of_best, best_of_second), (Some(a), Some(b)) if a < b);
+            let [first, runner_up] = [best, second].map(|row| &self.rows[row].cells[position]);
+            let clears = first.clears(runner_up, self.columns[position].better);
             if clears
                 && self.rows[best].kind == RowKind::System
                 && !self.rows[best].cells[position].in_brackets
@@ -90,12 +84,19 @@ impl Table {
             }
         }
     }
+}
 
-    /// The end of a cell's interval, in a sense where lower is better: the worse one for `side` 1, the better one for -1.
-    fn edge(&self, row: usize, position: usize, sign: f64, side: f64) -> Option<f64> {
-        let interval = self.rows[row].cells[position].interval?;
-        let (a, b) = (sign * interval.low, sign * interval.high);
-        Some(if side > 0.0 { a.max(b) } else { a.min(b) })
+impl Cell {
+    /// Whether this interval lies wholly on the better side of the other's, or of its value where that has no interval.
+    #[must_use]
+    pub fn clears(&self, other: &Self, better: Better) -> bool {
+        let value = other.value.map(|value| (value, value));
+        let other = other.interval.map(|i| (i.low, i.high)).or(value);
+        match (self.interval, other, better) {
+            (Some(own), Some((low, _)), Better::Lower) => own.high < low,
+            (Some(own), Some((_, high)), Better::Higher) => own.low > high,
+            _ => false,
+        }
     }
 }
 

@@ -24,15 +24,11 @@ pub fn against_trivial(table: &Table) -> Vec<String> {
 fn sentence(table: &Table, row: &Row) -> Option<String> {
     let (mut beats, mut unclear, mut loses) = (Vec::new(), Vec::new(), Vec::new());
     for (position, column) in table.columns.iter().enumerate() {
-        let sign = match column.better {
-            Better::Lower => 1.0,
-            Better::Higher => -1.0,
-        };
         let own = &row.cells[position];
-        let Some((name, best)) = best_trivial(table, position, sign) else {
+        let Some((name, best)) = best_trivial(table, position) else {
             continue;
         };
-        let Some(verdict) = verdict(own, best, sign) else {
+        let Some(verdict) = verdict(own, best, column.better) else {
             continue;
         };
         match verdict {
@@ -54,7 +50,8 @@ fn sentence(table: &Table, row: &Row) -> Option<String> {
 }
 
 /// The trivial baseline with the best value. The tokenizer floor is what can be reached, not what has to be beaten.
-fn best_trivial(table: &Table, position: usize, sign: f64) -> Option<(&str, &Cell)> {
+fn best_trivial(table: &Table, position: usize) -> Option<(&str, &Cell)> {
+    let sign = table.columns[position].better.sign();
     table
         .rows
         .iter()
@@ -67,17 +64,12 @@ fn best_trivial(table: &Table, position: usize, sign: f64) -> Option<(&str, &Cel
         .map(|(_, row, cell)| (row.label.as_str(), cell))
 }
 
-fn verdict(own: &Cell, best: &Cell, sign: f64) -> Option<Verdict> {
-    let (a, b) = (sign * own.value?, sign * best.value?);
-    let apart = match (&own.interval, &best.interval) {
-        (Some(own), Some(best)) if sign > 0.0 => own.high < best.low,
-        (Some(own), Some(best)) => own.low > best.high,
-        _ => false,
-    };
-    Some(match (a < b, apart) {
-        (true, true) => Verdict::Beats,
-        (true, false) => Verdict::Unclear,
-        (false, _) => Verdict::Loses,
+fn verdict(own: &Cell, best: &Cell, better: Better) -> Option<Verdict> {
+    let (a, b) = (better.sign() * own.value?, better.sign() * best.value?);
+    Some(match a < b {
+        true if best.interval.is_some() && own.clears(best, better) => Verdict::Beats,
+        true => Verdict::Unclear,
+        false => Verdict::Loses,
     })
 }
 

@@ -134,24 +134,28 @@ impl Mget {
             };
         }
         let samples = Segments::within(&lengths);
-
-        // What a token says, and where it stands; the second is used twice.
-        let x_ND = self.encoder_embeddings.content(visible);
         let place_ND = self.encoder_embeddings.place(&visible.sequence);
-
-        let input_ND = x_ND + place_ND.clone();
+        let input_ND = self.seen(visible, place_ND.clone());
         let mut h_ND = input_ND.clone();
         for block in &self.encoder {
             h_ND = block.forward(h_ND, &samples);
         }
         let h_ND = self.encoder_norm.forward(h_ND);
-
-        let context_ND = self.decoder_proj_context.forward(h_ND.clone()) + place_ND;
         Context {
-            tokens_ND: Some(context_ND),
+            tokens_ND: Some(self.context(h_ND.clone(), place_ND)),
             lengths,
             trace: Some([input_ND, h_ND]),
         }
+    }
+
+    /// What the encoder starts from, `[N, D]`: what a token says and where it stands. The place is used again in the context.
+    pub(super) fn seen(&self, visible: &Visible, place_ND: Tensor<2>) -> Tensor<2> {
+        self.encoder_embeddings.content(visible) + place_ND
+    }
+
+    /// What the decoder sees of the encoder's normalised output, `[N, D]`.
+    pub(super) fn context(&self, h_ND: Tensor<2>, place_ND: Tensor<2>) -> Tensor<2> {
+        self.decoder_proj_context.forward(h_ND) + place_ND
     }
 
     /// Answers for the asked positions: `[M, D]`; `None` when nothing is asked.
@@ -160,10 +164,7 @@ impl Mget {
         if asked.is_empty() {
             return None;
         }
-        // A token attends to the tokens of its own modality in its own sample, and to all of the sample's visible tokens.
-        let own_modality = Segments::within(&asked.runs);
-        let visible = Segments::across(&asked.lengths, &context.lengths);
-
+        let (own_modality, visible) = decoder_segments(&context.lengths, asked);
         let mut y_MD = self.questions(asked);
         for block in &self.decoder {
             y_MD = block.forward(y_MD, context.tokens_ND.as_ref(), &own_modality, &visible);
@@ -269,6 +270,15 @@ impl DecoderBlock {
         }
         y_MD.clone() + self.mlp.forward(self.norm2.forward(y_MD))
     }
+}
+
+/// Who attends to whom: an asked token to those of its own modality in its own sample, and to all `visible` (rows per sample) of
+/// the sample.
+pub(super) fn decoder_segments(visible: &[usize], asked: &Sequence) -> (Segments, Segments) {
+    (
+        Segments::within(&asked.runs),
+        Segments::across(&asked.lengths, visible),
+    )
 }
 
 /// A layer norm without bias.

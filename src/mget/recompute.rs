@@ -1,9 +1,9 @@
 //! Gradients with the activations of one block at a time: of every block its input is kept, and backward computes the block
 //! once more. More arithmetic, and memory that hardly grows with depth.
 
-use super::batch::{Batch, Sequence, Visible};
+use super::batch::{Batch, Visible};
 use super::loss::{Loss, LossValues};
-use super::model::Mget;
+use super::model::{Mget, decoder_segments};
 use crate::engine::{Gradients, Parameters, Segments, Tensor};
 
 impl Mget {
@@ -20,7 +20,7 @@ impl Mget {
         let encoder = frozen.encoder_inputs(&batch.visible);
         let context_ND = encoder.last().map(|h_ND| {
             let place_ND = frozen.encoder_embeddings.place(&batch.visible.sequence);
-            frozen.context(h_ND.clone(), place_ND)
+            frozen.context(frozen.encoder_norm.forward(h_ND.clone()), place_ND)
         });
         let decoder = frozen.decoder_inputs(context_ND.as_ref(), batch);
         drop(frozen);
@@ -45,7 +45,7 @@ impl Mget {
         drop(y_MD);
 
         let asked = &batch.targets.sequence;
-        let (own_modality, visible) = decoder_segments(&batch.visible, asked);
+        let (own_modality, visible) = decoder_segments(&batch.visible.sequence.lengths, asked);
         let mut dcontext_ND: Option<Tensor<2>> = None;
         for (block, input_MD) in self.decoder.iter().zip(&decoder).rev() {
             let y_MD = leaf(input_MD);
@@ -67,7 +67,7 @@ impl Mget {
 
         if let (Some(dcontext_ND), Some(h_ND)) = (dcontext_ND, encoder.last().map(leaf)) {
             let place_ND = self.encoder_embeddings.place(&batch.visible.sequence);
-            let context_ND = self.context(h_ND.clone(), place_ND);
+            let context_ND = self.context(self.encoder_norm.forward(h_ND.clone()), place_ND);
             let [mut dh_ND] = gradients.add(&(context_ND * dcontext_ND).sum(), self, [&h_ND]);
             let samples = Segments::within(&batch.visible.sequence.lengths);
             for (block, input_ND) in self.encoder.iter().zip(&encoder).rev() {
@@ -75,20 +75,13 @@ impl Mget {
                 let out_ND = block.forward(h_ND.clone(), &samples);
                 [dh_ND] = gradients.add(&(out_ND * dh_ND).sum(), self, [&h_ND]);
             }
-            let [] = gradients.add(&(self.seen(&batch.visible) * dh_ND).sum(), self, []);
+            // Anew: backward has consumed the graph of the first.
+            let place_ND = self.encoder_embeddings.place(&batch.visible.sequence);
+            let input_ND = self.seen(&batch.visible, place_ND);
+            let [] = gradients.add(&(input_ND * dh_ND).sum(), self, []);
         }
         gradients.complete(self);
         (values, Some(gradients))
-    }
-
-    /// What the encoder starts from.
-    fn seen(&self, visible: &Visible) -> Tensor<2> {
-        self.encoder_embeddings.content(visible) + self.encoder_embeddings.place(&visible.sequence)
-    }
-
-    fn context(&self, h_ND: Tensor<2>, place_ND: Tensor<2>) -> Tensor<2> {
-        let h_ND = self.encoder_norm.forward(h_ND);
-        self.decoder_proj_context.forward(h_ND) + place_ND
     }
 
     /// The input of every block of the encoder, and the output of the last; nothing when nothing is visible.
@@ -97,7 +90,8 @@ impl Mget {
             return Vec::new();
         }
         let samples = Segments::within(&visible.sequence.lengths);
-        let mut inputs = vec![self.seen(visible)];
+        let place_ND = self.encoder_embeddings.place(&visible.sequence);
+        let mut inputs = vec![self.seen(visible, place_ND)];
         for (place, block) in self.encoder.iter().enumerate() {
             inputs.push(block.forward(inputs[place].clone(), &samples));
         }
@@ -110,7 +104,7 @@ impl Mget {
         if asked.is_empty() {
             return Vec::new();
         }
-        let (own_modality, visible) = decoder_segments(&batch.visible, asked);
+        let (own_modality, visible) = decoder_segments(&batch.visible.sequence.lengths, asked);
         let mut inputs = vec![self.questions(asked)];
         for (place, block) in self.decoder.iter().enumerate() {
             let y_MD = inputs[place].clone();
@@ -118,14 +112,6 @@ impl Mget {
         }
         inputs
     }
-}
-
-/// Who attends to whom, as in [`Mget::decode`]: own modality, and all that is visible of the sample.
-fn decoder_segments(visible: &Visible, asked: &Sequence) -> (Segments, Segments) {
-    (
-        Segments::within(&asked.runs),
-        Segments::across(&asked.lengths, &visible.sequence.lengths),
-    )
 }
 
 /// A value whose gradient is asked for.
