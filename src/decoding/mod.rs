@@ -1,8 +1,9 @@
 //! Iterative parallel decoding (Supp. C): given any tokens, generate any others.
 //!
 //! Read in this order: [`settings`] (a registry entry), [`schedule`] (tokens and temperature per step), [`plan`] (which target
-//! when, from what), [`model`] (what a model must answer), [`filter`] (logits to a token), [`mod@generate`] (**the loop**), [`mget`] (the model), [`reconstructor`] (a model folder
-//! with its tokenizers as one function from clips to clips).
+//! when, from what), [`model`] (what a model must answer), [`filter`] (logits to a token), [`mod@generate`] (the
+//! entry), `round` (**the loop**), [`mget`] (the model), [`reconstructor`] (a model folder with its tokenizers as one function
+//! from clips to clips).
 
 pub mod filter;
 pub mod generate;
@@ -10,6 +11,7 @@ pub mod mget;
 pub mod model;
 pub mod plan;
 pub mod reconstructor;
+mod round;
 pub mod schedule;
 pub mod settings;
 

@@ -2,7 +2,7 @@
 //!
 //! Read in this order: [`outcome`] (what a metric can say), the metrics [`joints`], [`trajectory`], [`gaze`], [`depth`],
 //! [`motion`], [`tokens`], [`runtime`]; then [`evaluate`] (every clip of a [`suite`] into [`scores`]), [`statistics`], and [`compare`]
-//! (many scores into one [`table`], which [`render`] prints and
+//! (many scores into one [`table`], a `side` per row, which [`render`] prints and
 //! [`intervals`] draws; `verdict` says what beats the trivial baselines). [`tum`] compares trajectory files.
 //!
 //! Arithmetic is f64; inputs are metres and seconds; angles are reported in degrees.
@@ -33,6 +33,7 @@ pub mod runtime;
 pub mod sample;
 mod score_clip;
 pub mod scores;
+mod side;
 pub mod statistics;
 pub mod suite;
 pub mod table;

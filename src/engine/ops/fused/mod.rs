@@ -319,6 +319,18 @@ mod tests {
                 |x| composed::self_attention(x[0].clone(), 2, &Segments::batch(3, 20)),
             ),
             (
+                "attention over several tiles of queries and keys",
+                vec![wave([140, 8], 0.0) * 6.0, wave([1700, 16], 0.5) * 6.0],
+                |x| {
+                    let segments = Segments::across(&[140], &[1700]);
+                    ops::cross_attention(x[0].clone(), x[1].clone(), 2, &segments)
+                },
+                |x| {
+                    let segments = Segments::across(&[140], &[1700]);
+                    composed::cross_attention(x[0].clone(), x[1].clone(), 2, &segments)
+                },
+            ),
+            (
                 "cross-attention with gaps and shared keys",
                 vec![wave([173, 8], 0.0), wave([70, 16], 0.5)],
                 |x| ops::cross_attention(x[0].clone(), x[1].clone(), 2, &ragged()),

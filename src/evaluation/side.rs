@@ -1,0 +1,164 @@
+//! One row's scores on the common clips: its cells, and its differences from another row.
+
+use super::columns::Column;
+use super::compare::IntervalSettings;
+use super::outcome::{Outcome, mean};
+use super::scores::{ScoreSet, Scores};
+use super::statistics::{
+    Difference, Interval, Over, Summary, bootstrap_mean, holm, paired_difference, student_interval,
+    summarise,
+};
+use super::table::{Cell, Row};
+use std::collections::BTreeMap;
+
+/// A score set seen on the common clips.
+pub(super) struct On<'a> {
+    set: &'a ScoreSet,
+    /// Position of every common clip in the set.
+    order: Vec<usize>,
+}
+
+impl<'a> On<'a> {
+    pub(super) fn of(scores: &Scores, set: &'a ScoreSet, common: &[String]) -> Self {
+        let position: BTreeMap<&String, usize> = scores
+            .clips
+            .iter()
+            .enumerate()
+            .map(|(i, c)| (c, i))
+            .collect();
+        Self {
+            set,
+            order: common.iter().map(|clip| position[clip]).collect(),
+        }
+    }
+
+    fn values(&self, column: &str) -> Option<Vec<Outcome>> {
+        let values = &self.set.column(column)?.values;
+        Some(self.order.iter().map(|&i| values[i]).collect())
+    }
+}
+
+/// One row's score sets, one per seed.
+pub(super) struct Side<'a> {
+    pub(super) sets: Vec<On<'a>>,
+}
+
+impl Side<'_> {
+    pub(super) fn cell(&self, column: &Column, settings: &IntervalSettings) -> Cell {
+        if column.is_per_set() {
+            return self.set_cell(column, settings);
+        }
+        let per_seed: Vec<Vec<Outcome>> = self
+            .sets
+            .iter()
+            .filter_map(|s| s.values(&column.name))
+            .collect();
+        if per_seed.is_empty() {
+            return Cell::default();
+        }
+        let summaries: Vec<Summary> = per_seed.iter().map(|values| summarise(values)).collect();
+        let seed_means: Vec<f64> = summaries.iter().filter_map(|s| s.mean).collect();
+        let least = summaries.iter().map(|s| s.n).min().unwrap_or(0);
+        let per_clip: Vec<f64> = clip_means(&per_seed).into_iter().flatten().collect();
+        let over = |what| settings.over.contains(&what);
+        let seeds = over(Over::Seeds)
+            .then(|| student_interval(&seed_means, settings.level))
+            .flatten();
+        let clips = over(Over::Clips)
+            .then(|| bootstrap_mean(&per_clip, settings.level, settings.resamples, settings.seed))
+            .flatten();
+        Cell {
+            value: mean(seed_means.iter().copied()),
+            interval: wider(seeds, clips),
+            n: least,
+            seeds: per_seed.len(),
+            n_null: summaries.iter().map(|s| s.n_null).max().unwrap_or(0),
+            n_degenerate: summaries.iter().map(|s| s.n_degenerate).max().unwrap_or(0),
+            ..Cell::default()
+        }
+    }
+
+    /// Set-wide numbers belong to the set they were computed on; only seeds can vary.
+    fn set_cell(&self, column: &Column, settings: &IntervalSettings) -> Cell {
+        let scores: Vec<_> = self
+            .sets
+            .iter()
+            .filter_map(|s| s.set.set(&column.name))
+            .collect();
+        let values: Vec<f64> = scores.iter().filter_map(|s| s.value).collect();
+        let interval = settings
+            .over
+            .contains(&Over::Seeds)
+            .then(|| student_interval(&values, settings.level))
+            .flatten();
+        Cell {
+            value: mean(values.iter().copied()),
+            interval,
+            n: scores.iter().map(|s| s.n).min().unwrap_or(0),
+            seeds: scores.len(),
+            floor: scores.first().and_then(|s| s.floor),
+            in_brackets: scores.iter().any(|s| s.in_brackets()),
+            reason: scores.iter().find_map(|s| s.unavailable.clone()),
+            ..Cell::default()
+        }
+    }
+}
+
+/// Every clip's mean over the seeds that have a number; `None` where no seed has one.
+fn clip_means(per_seed: &[Vec<Outcome>]) -> Vec<Option<f64>> {
+    let clips = per_seed.first().map_or(0, Vec::len);
+    (0..clips)
+        .map(|i| mean(per_seed.iter().filter_map(|values| values[i].number())))
+        .collect()
+}
+
+fn wider(a: Option<Interval>, b: Option<Interval>) -> Option<Interval> {
+    match (a, b) {
+        (Some(a), Some(b)) => Some(if a.width() >= b.width() { a } else { b }),
+        (a, b) => a.or(b),
+    }
+}
+
+/// Paired differences of every row against row `reference`, Holm-corrected over the rows of each column.
+pub(super) fn add_differences(
+    rows: &mut [Row],
+    sides: &[Side],
+    reference: usize,
+    columns: &[Column],
+    settings: &IntervalSettings,
+) {
+    for (position, column) in columns.iter().enumerate() {
+        if column.is_per_set() {
+            continue;
+        }
+        let means = |side: &Side| {
+            let per_seed: Vec<_> = side
+                .sets
+                .iter()
+                .filter_map(|s| s.values(&column.name))
+                .collect();
+            clip_means(&per_seed)
+        };
+        let base = means(&sides[reference]);
+        let mut found: Vec<(usize, Difference)> = Vec::new();
+        for (i, side) in sides.iter().enumerate().filter(|(i, _)| *i != reference) {
+            let pairs: Vec<(f64, f64)> = means(side)
+                .iter()
+                .zip(&base)
+                .filter_map(|(a, b)| Some(((*a)?, (*b)?)))
+                .collect();
+            found.extend(
+                paired_difference(&pairs, settings.level, settings.resamples, settings.seed)
+                    .map(|d| (i, d)),
+            );
+        }
+        let p: Vec<f64> = found.iter().filter_map(|(_, d)| d.p).collect();
+        let mut corrected = holm(&p).into_iter();
+        for (i, mut difference) in found {
+            if difference.p.is_some() {
+                difference.p_holm = corrected.next();
+            }
+            rows[i].cells[position].difference = Some(difference);
+        }
+    }
+}
