@@ -1,10 +1,10 @@
-//! The page of a run, `report/index.html`: state, stages, times, curves, what the ops have to show, settings, origin. One
-//! file, no network, no script.
+//! The page of a run, `report/index.html`: what came out, stages and times, curves and numbers, what the other ops have to
+//! show, settings, origin. One file, no network, no script.
 //!
 //! An op joins in by leaving `report/*.md`, `report/*.svg` or `report/*.png` in its artifact (or
 //! `reconstruction/view.html`, which is linked): pieces are shown in the order of their names under the stage's heading.
 
-use super::cache::Cache;
+use super::cache::{Cache, Key};
 use super::curves::{self, Curve};
 use super::environment;
 use super::error::{AtPath, RunError};
@@ -17,7 +17,7 @@ use super::provenance::LockFile;
 use super::record::{Run, RunDirectory};
 use super::schedule::{Schedule, Work};
 use super::stage::StageRecord;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 use std::path::Path;
 
@@ -37,10 +37,15 @@ pub fn write(directory: &RunDirectory) -> Result<(), RunError> {
     let cache = cache_of(directory.runs());
     let mut page = String::new();
     head(&mut page, &run, &schedule, directory);
-    stages(&mut page, &schedule, directory);
     comparison(&mut page, directory);
-    plots(&mut page, &schedule, directory, &cache)?;
-    for work in &schedule.works {
+    let (results, parts) = results(&schedule);
+    for work in results {
+        sections(&mut page, work, &schedule, &cache)?;
+        linked(&mut page, work, &schedule, directory, &cache)?;
+    }
+    stages(&mut page, &schedule, directory);
+    measurements(&mut page, &schedule, directory, &cache)?;
+    for work in parts {
         sections(&mut page, work, &schedule, &cache)?;
         linked(&mut page, work, &schedule, directory, &cache)?;
     }
@@ -96,6 +101,16 @@ fn head(page: &mut String, run: &Run, schedule: &Schedule, directory: &RunDirect
         let _ = writeln!(page, "<tr><th>{name}</th><td>{}</td></tr>", escape(&value));
     }
     page.push_str("</table>\n");
+}
+
+/// What an experiment is for, and the rest: the stages that no other reads. A sweep's result is its comparison.
+fn results(schedule: &Schedule) -> (Vec<&Work>, Vec<&Work>) {
+    let ports = schedule.works.iter().flat_map(|work| &work.inputs);
+    let read: BTreeSet<&Key> = ports.flat_map(|p| &p.from).map(|(_, key)| key).collect();
+    schedule
+        .works
+        .iter()
+        .partition(|work| !schedule.sweep && !read.contains(&work.key))
 }
 
 /// The table of a sweep's `compare:` block, if it was written: it needs every arm.
@@ -155,8 +170,8 @@ fn stages(page: &mut String, schedule: &Schedule, directory: &RunDirectory) {
     page.push_str("</table>\n");
 }
 
-/// One plot per stage name and metric, with a line per cell.
-fn plots(
+/// What was measured on the way: one plot per stage name and metric, with a line per cell; a table of what was measured once.
+fn measurements(
     page: &mut String,
     schedule: &Schedule,
     directory: &RunDirectory,
@@ -200,16 +215,20 @@ fn plots(
                 .push(Curve { name, points });
         }
     }
-    if plots.is_empty() {
-        return Ok(());
+    let (plots, once): (Vec<_>, Vec<_>) = plots
+        .into_iter()
+        .partition(|(_, curves)| curves.iter().any(|curve| curve.points.len() > 1));
+    if !plots.is_empty() {
+        page.push_str("<h2>Curves</h2>\n<div class=\"plots\">\n");
     }
-    page.push_str("<h2>Curves</h2>\n<div class=\"plots\">\n");
     for ((stage, metric), curves) in plots.iter().take(MOST_PLOTS) {
         if let Some(svg) = curves::svg(&format!("{}: {metric}", order[*stage]), curves) {
             image(page, "svg+xml", svg.as_bytes(), metric);
         }
     }
-    page.push_str("</div>\n");
+    if !plots.is_empty() {
+        page.push_str("</div>\n");
+    }
     if plots.len() > MOST_PLOTS {
         let _ = writeln!(
             page,
@@ -217,7 +236,37 @@ fn plots(
             plots.len() - MOST_PLOTS
         );
     }
+    if once.is_empty() {
+        return Ok(());
+    }
+    page.push_str("<h2>Numbers</h2>\n<table>\n<tr><th>stage</th><th>metric</th><th class=\"n\">value</th></tr>\n");
+    for ((stage, metric), curves) in &once {
+        let values = curves.iter().flat_map(|curve| &curve.points);
+        let (least, most) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(least, most), at| {
+            (least.min(at.1), most.max(at.1))
+        });
+        let value = if least < most {
+            format!("{} to {}", number(least), number(most))
+        } else {
+            number(most)
+        };
+        let _ = writeln!(
+            page,
+            "<tr><td>{}</td><td>{}</td><td class=\"n\">{value}</td></tr>",
+            escape(order[*stage]),
+            escape(metric),
+        );
+    }
+    page.push_str("</table>\n");
     Ok(())
+}
+
+fn number(value: f64) -> String {
+    if value == 0.0 || (1e-3..1e6).contains(&value.abs()) {
+        format!("{value:.4}")
+    } else {
+        format!("{value:.3e}")
+    }
 }
 
 /// What an op left to be shown.
