@@ -320,7 +320,7 @@ mod tests {
             ),
             (
                 "attention over several tiles of queries and keys",
-                vec![wave([140, 8], 0.0) * 6.0, wave([1700, 16], 0.5) * 6.0],
+                vec![wave([140, 8], 0.0) * 2.0, wave([1700, 16], 0.5) * 2.0],
                 |x| {
                     let segments = Segments::across(&[140], &[1700]);
                     ops::cross_attention(x[0].clone(), x[1].clone(), 2, &segments)
