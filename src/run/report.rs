@@ -17,6 +17,8 @@ use super::provenance::LockFile;
 use super::record::{Run, RunDirectory};
 use super::schedule::{Schedule, Work};
 use super::stage::StageRecord;
+use base64::Engine as _;
+use base64::engine::general_purpose::STANDARD;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 use std::path::Path;
@@ -59,7 +61,7 @@ pub fn write(directory: &RunDirectory) -> Result<(), RunError> {
 const STYLE: &str = "body{font:15px/1.5 system-ui,sans-serif;margin:0;color:#1a1a1a;background:#fff}\
 main{max-width:64rem;margin:0 auto;padding:1.5rem}h1{margin:.2rem 0}h2{margin-top:2rem;border-bottom:1px solid #ccc}\
 table{border-collapse:collapse;margin:.8rem 0;display:block;overflow-x:auto}th,td{padding:.2rem .7rem;text-align:left;\
-border-bottom:1px solid #e3e3e3;white-space:nowrap}.n{text-align:right;font-variant-numeric:tabular-nums}\
+border-bottom:1px solid #e3e3e3;white-space:nowrap;font-variant-numeric:tabular-nums}.n{text-align:right}\
 code,pre{font:13px/1.45 ui-monospace,monospace}pre{background:#f5f5f5;padding:.8rem;overflow-x:auto}\
 .plots{display:flex;flex-wrap:wrap;gap:.5rem}img{max-width:100%}summary{cursor:pointer}\
 @media(prefers-color-scheme:dark){body{background:#161616;color:#e8e8e8}pre{background:#222}th,td{border-color:#333}\
@@ -242,14 +244,7 @@ fn measurements(
     page.push_str("<h2>Numbers</h2>\n<table>\n<tr><th>stage</th><th>metric</th><th class=\"n\">value</th></tr>\n");
     for ((stage, metric), curves) in &once {
         let values = curves.iter().flat_map(|curve| &curve.points);
-        let (least, most) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |(least, most), at| {
-            (least.min(at.1), most.max(at.1))
-        });
-        let value = if least < most {
-            format!("{} to {}", number(least), number(most))
-        } else {
-            number(most)
-        };
+        let value = spread(values.map(|(_, value)| *value));
         let _ = writeln!(
             page,
             "<tr><td>{}</td><td>{}</td><td class=\"n\">{value}</td></tr>",
@@ -259,6 +254,18 @@ fn measurements(
     }
     page.push_str("</table>\n");
     Ok(())
+}
+
+/// One number, or the least and the most; `NaN` where there is no other.
+fn spread(values: impl Iterator<Item = f64>) -> String {
+    let (least, most) = values.fold((f64::NAN, f64::NAN), |(least, most), value| {
+        (least.min(value), most.max(value))
+    });
+    if least < most {
+        format!("{} to {}", number(least), number(most))
+    } else {
+        number(most)
+    }
 }
 
 fn number(value: f64) -> String {
@@ -400,46 +407,18 @@ fn image(page: &mut String, kind: &str, bytes: &[u8], name: &str) {
         page,
         "<img alt=\"{}\" src=\"data:image/{kind};base64,{}\">",
         escape(name),
-        base64(bytes)
+        STANDARD.encode(bytes)
     );
-}
-
-fn base64(bytes: &[u8]) -> String {
-    const DIGITS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
-    let mut text = String::with_capacity(bytes.len().div_ceil(3) * 4);
-    for chunk in bytes.chunks(3) {
-        let bits = chunk
-            .iter()
-            .fold(0, |bits, &byte| bits << 8 | u32::from(byte))
-            << (8 * (3 - chunk.len()));
-        for digit in 0..4 {
-            let shown = digit <= chunk.len();
-            let index = (bits >> (18 - 6 * digit)) & 63;
-            text.push(if shown {
-                char::from(DIGITS[index as usize])
-            } else {
-                '='
-            });
-        }
-    }
-    text
 }
 
 #[cfg(test)]
 mod tests {
-    use super::base64;
+    use super::*;
 
     #[test]
-    fn base64_is_that_of_rfc_4648() {
-        let cases = [
-            ("", ""),
-            ("f", "Zg=="),
-            ("fo", "Zm8="),
-            ("foo", "Zm9v"),
-            ("foobar", "Zm9vYmFy"),
-        ];
-        for (bytes, text) in cases {
-            assert_eq!(base64(bytes.as_bytes()), text);
-        }
+    fn a_metric_that_is_no_number_is_not_shown_as_one() {
+        assert_eq!(spread([f64::NAN].into_iter()), "NaN");
+        assert_eq!(spread([2.0, f64::NAN, 1.0].into_iter()), "1.0000 to 2.0000");
+        assert_eq!(spread([0.0, 0.0].into_iter()), "0.0000");
     }
 }
