@@ -1,4 +1,4 @@
-//! Depth as video: metres to the 8-bit levels the video tokenizer sees, and back (model reference 1.2).
+//! Depth as video: metres to the 8-bit levels the video tokenizer sees, and back.
 //!
 //! What the levels mean is always said, never guessed: a kind (depth or disparity) and a range (the clip's own or a fixed one).
 

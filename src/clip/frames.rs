@@ -1,5 +1,5 @@
 //! Frames of reference: hands in the camera of the same sample, the body in the gravity frame of the first camera
-//! (Sec. 3.2; model reference 9.4).
+//! (Sec. 3.2).
 
 use super::{CameraTrack, JointTrack};
 use nalgebra::{Isometry3, Matrix3, Point3, Rotation3, Unit, UnitQuaternion, Vector3};

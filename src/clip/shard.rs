@@ -135,7 +135,7 @@ struct Place {
 #[derive(Debug, Clone)]
 pub struct Shards {
     tars: Vec<PathBuf>,
-    /// Stems in the order of their first appearance: shard by shard, modality by modality.
+    /// Stems in the order of their first appearance: shard by shard, data set by data set, the fullest tar first.
     samples: Vec<String>,
     modalities: BTreeMap<String, BTreeMap<String, Place>>,
 }
@@ -151,14 +151,16 @@ impl Shards {
             if modality.is_dir() {
                 let name = file_name(&modality);
                 tars_below(&modality, 3, &mut |path| {
-                    found.push((file_name(path), name.clone(), path.to_owned()));
+                    let folder = path.parent().unwrap_or(path);
+                    let dataset = folder.strip_prefix(&modality).unwrap_or(folder).to_owned();
+                    found.push((file_name(path), dataset, name.clone(), path.to_owned()));
                 })?;
             }
         }
         if found.is_empty() {
             return Err(ShardError::Empty(root.to_owned()));
         }
-        // By shard, then data set (in the path), then modality, so that samples keep the order they were written in.
+        // By shard, then data set, so that samples keep the order they were written in.
         found.sort();
         let mut shards = Self {
             tars: Vec::new(),
@@ -166,24 +168,31 @@ impl Shards {
             modalities: BTreeMap::new(),
         };
         let mut known = std::collections::BTreeSet::new();
-        for (_, modality, path) in found {
-            let tar = shards.tars.len() as u32;
-            let members = index(&path, tar)?;
-            let places = shards.modalities.entry(modality).or_default();
-            for (stem, place) in members {
-                if known.insert(stem.clone()) {
-                    shards.samples.push(stem.clone());
-                }
-                if places.contains_key(&stem) {
-                    return Err(ShardError::Member {
-                        path,
-                        member: stem,
-                        reason: "is there twice".to_owned(),
-                    });
-                }
-                places.insert(stem, place);
+        for tars in found.chunk_by(|a, b| (&a.0, &a.1) == (&b.0, &b.1)) {
+            let mut lists = Vec::with_capacity(tars.len());
+            for (_, _, modality, path) in tars {
+                let members = index(path, shards.tars.len() as u32)?;
+                shards.tars.push(path.clone());
+                lists.push((modality, path, members));
             }
-            shards.tars.push(path);
+            // The fullest tells the order of most samples: a modality that some lack would put those last.
+            lists.sort_by_key(|(_, _, members)| std::cmp::Reverse(members.len()));
+            for (modality, path, members) in lists {
+                let places = shards.modalities.entry(modality.clone()).or_default();
+                for (stem, place) in members {
+                    if known.insert(stem.clone()) {
+                        shards.samples.push(stem.clone());
+                    }
+                    if places.contains_key(&stem) {
+                        return Err(ShardError::Member {
+                            path: path.clone(),
+                            member: stem,
+                            reason: "is there twice".to_owned(),
+                        });
+                    }
+                    places.insert(stem, place);
+                }
+            }
         }
         Ok(shards)
     }
@@ -351,6 +360,30 @@ mod tests {
         assert_eq!(shards.read(0, "gaze").unwrap().unwrap(), b"world/000005");
         assert_eq!(shards.read(1, "gaze").unwrap(), None);
         assert!(shards.read(6, "gaze").is_err());
+    }
+
+    #[test]
+    fn a_sample_without_the_first_modality_keeps_its_place() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut writer = ShardWriter::new(folder.path(), 0);
+        for dataset in ["adt", "world"] {
+            for i in 0..3 {
+                let stem = format!("{dataset}/{i}");
+                if i != 0 {
+                    writer.add(&format!("body/{dataset}"), &stem, b"1").unwrap();
+                }
+                writer
+                    .add(&format!("camera/{dataset}"), &stem, b"1")
+                    .unwrap();
+            }
+        }
+        writer.finish().unwrap();
+        let shards = Shards::open(folder.path()).unwrap();
+        assert_eq!(
+            shards.samples(),
+            ["adt/0", "adt/1", "adt/2", "world/0", "world/1", "world/2"]
+        );
+        assert!(!shards.has(0, "body") && shards.has(5, "body"));
     }
 
     #[test]

@@ -10,20 +10,10 @@ use crate::formats::FormatError;
 use crate::formats::npy::NpyArray;
 use crate::formats::npz::Npz;
 use crate::geometry::rigid;
+use crate::modality::BUILT_IN;
 use nalgebra::{Unit, Vector3};
 use ndarray::{Array1, Array3, ArrayD, Ix1, Ix2, Ix3, Ix4, IxDyn};
 use std::path::Path;
-
-/// The modalities that are fields of a [`Clip`]; any other folder holds a declared one.
-const FIELDS: [&str; 7] = [
-    "rgb",
-    "depth",
-    "camera",
-    "gaze",
-    "left_hand",
-    "right_hand",
-    "body",
-];
 
 /// Why a member is not what it should be.
 #[derive(Debug, thiserror::Error)]
@@ -224,7 +214,8 @@ fn put(clip: &mut Clip, modality: &str, bytes: &[u8]) -> Result<(), Content> {
             _ => Err(Content::Words("`rate` is not a positive number".to_owned())),
         }
     };
-    if !FIELDS.contains(&modality) {
+    // What is no field of a clip is a declared modality.
+    if !BUILT_IN.contains(&modality) {
         let values = npz.get("values")?.to::<f32>()?;
         let valid = npz
             .arrays

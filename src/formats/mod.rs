@@ -59,6 +59,18 @@ impl FormatError {
     }
 }
 
+/// A temporary file in `folder` that will be renamed, with the rights that a file made in place would have: the process's umask
+/// applies, where the default of `tempfile` would hide the file from colleagues.
+pub(crate) fn temporary_in(folder: &Path) -> std::io::Result<tempfile::NamedTempFile> {
+    let mut builder = tempfile::Builder::new();
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::PermissionsExt;
+        builder.permissions(std::fs::Permissions::from_mode(0o666));
+    }
+    builder.tempfile_in(folder)
+}
+
 /// Writes `bytes` to a temporary name beside `path` and renames it, so that a reader never sees half a file.
 pub(crate) fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), FormatError> {
     use std::io::Write;
@@ -66,9 +78,27 @@ pub(crate) fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), FormatEr
         .parent()
         .filter(|p| !p.as_os_str().is_empty())
         .unwrap_or(Path::new("."));
-    let mut file = tempfile::NamedTempFile::new_in(folder)?;
+    let mut file = temporary_in(folder)?;
     file.write_all(bytes)?;
     file.as_file().sync_all()?;
     file.persist(path).map_err(|e| e.error)?;
     Ok(())
+}
+
+#[cfg(all(test, unix))]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_written_file_has_the_rights_of_any_new_file() {
+        use std::os::unix::fs::PermissionsExt;
+        let folder = tempfile::tempdir().unwrap();
+        let rights = |name: &str| {
+            let path = folder.path().join(name);
+            std::fs::metadata(path).unwrap().permissions().mode()
+        };
+        std::fs::write(folder.path().join("plain"), b"1").unwrap();
+        write_atomically(&folder.path().join("renamed"), b"1").unwrap();
+        assert_eq!(rights("renamed"), rights("plain"));
+    }
 }

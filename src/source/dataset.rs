@@ -3,7 +3,7 @@
 use super::declared::DeclaredTrack;
 use super::recording::{CutSettings, Recording};
 use super::{Outcome, Source, SourceError};
-use crate::modality::{ClipFormat, DeclaredSettings};
+use crate::modality::{BUILT_IN, ClipFormat, DeclaredSettings};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, OnceLock};
@@ -57,6 +57,7 @@ impl Recordings {
         let (mut modalities, mut names): (Vec<String>, Vec<String>) = Default::default();
         for folder in &folders {
             let recording = open(folder, &settings)?;
+            recording.check(&settings)?;
             starts.push(starts[starts.len() - 1] + recording.clips(&settings));
             names.push(recording.id.clone());
             for modality in recording.modalities() {
@@ -65,16 +66,7 @@ impl Recordings {
                 }
             }
         }
-        let order = [
-            "rgb",
-            "depth",
-            "camera",
-            "gaze",
-            "left_hand",
-            "right_hand",
-            "body",
-        ];
-        modalities.sort_by_key(|name| order.iter().position(|known| known == name));
+        modalities.sort_by_key(|name| BUILT_IN.iter().position(|known| known == name));
         Ok(Recordings {
             name: name.to_owned(),
             settings,
@@ -222,7 +214,7 @@ pub fn find(
     let mut found = Vec::new();
     descend(root, 4, is_recording, &mut found)?;
     if found.is_empty() {
-        return Err(SourceError::missing(
+        return Err(SourceError::absent(
             root,
             format!("there is no {what} here"),
         ));

@@ -14,10 +14,10 @@ use super::{Outcome, Source, SourceError};
 use crate::clip::Depth;
 use crate::formats::npy::{self, NpyArray};
 use crate::formats::npz::Npz;
-use crate::geometry::camera::{Camera, KannalaBrandt, Lens};
+use crate::geometry::rigid::{self, PoseError, Rigid};
 use crate::modality::ClipFormat;
-use nalgebra::{Isometry3, Matrix3, Point3, Rotation3, UnitQuaternion, Vector3};
-use ndarray::{Array3, Axis};
+use nalgebra::Point3;
+use ndarray::{Array3, ArrayView2, Axis};
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
 use std::path::{Path, PathBuf};
@@ -115,14 +115,12 @@ impl Arrays {
             None if datasets.len() == 1 => datasets.into_iter().next().unwrap_or_default(),
             None => {
                 let names: Vec<String> = datasets.into_iter().collect();
-                return Err(SourceError::missing(
-                    root,
-                    if names.is_empty() {
-                        "there is no `<modality>/<data set>/` here".to_owned()
-                    } else {
-                        format!("name one of the data sets here: {}", names.join(", "))
-                    },
-                ));
+                return Err(if names.is_empty() {
+                    SourceError::absent(root, "there is no `<modality>/<data set>/` here")
+                } else {
+                    let names = names.join(", ");
+                    SourceError::missing(root, format!("name one of the data sets here: {names}"))
+                });
             }
         };
         let mut clips: BTreeMap<String, BTreeMap<&'static str, PathBuf>> = BTreeMap::new();
@@ -132,10 +130,13 @@ impl Arrays {
                 let Ok(entries) = std::fs::read_dir(&folder) else {
                     continue;
                 };
-                for entry in entries {
-                    let path = entry
-                        .map_err(|cause| SourceError::io(&folder, cause))?
-                        .path();
+                let mut paths = entries
+                    .map(|entry| entry.map(|entry| entry.path()))
+                    .collect::<Result<Vec<_>, _>>()
+                    .map_err(|cause| SourceError::io(&folder, cause))?;
+                // `x.npy` goes before `x.npz`, in whatever order the folder lists them.
+                paths.sort();
+                for path in paths {
                     let known = path
                         .extension()
                         .and_then(|extension| extension.to_str())
@@ -151,7 +152,7 @@ impl Arrays {
             }
         }
         if clips.is_empty() {
-            return Err(SourceError::missing(
+            return Err(SourceError::absent(
                 root,
                 format!("data set `{dataset}` has no clips here"),
             ));
@@ -186,18 +187,12 @@ impl Arrays {
             expect(path, poses.shape(), &[60, 4, 4])?;
             let mut samples = Vec::new();
             for (k, m) in poses.outer_iter().enumerate() {
-                if m.iter().all(|v| v.is_finite()) {
-                    let rotation = Rotation3::from_matrix(&Matrix3::from_fn(|r, c| m[[r, c]]));
-                    let shift = Vector3::new(m[[0, 3]], m[[1, 3]], m[[2, 3]]);
-                    let pose = Isometry3::from_parts(
-                        shift.into(),
-                        UnitQuaternion::from_rotation_matrix(&rotation),
-                    );
+                if let Some(pose) = pose(path, k, m)? {
                     samples.push((tick(k), pose));
                 }
             }
             recording.device = Some(Track::new(samples, SECOND / 10, SECOND / 60));
-            recording.cameras = vec![(0, stand_in())];
+            recording.cameras = vec![(0, MountedCamera::without_lens())];
         }
         if let Some(path) = files.get("gaze") {
             let points = array(path)?.to_dim::<f64, ndarray::Ix2>()?;
@@ -220,6 +215,7 @@ impl Arrays {
                 recording.hands_frame = JointFrame::Camera;
             }
         }
+        recording.check(&self.settings)?;
         Ok(recording)
     }
 }
@@ -322,22 +318,20 @@ fn tick(k: usize) -> i64 {
     (k as f64 / 30.0 * SECOND as f64).round() as i64
 }
 
-/// Poses are known, the lens is not.
-fn stand_in() -> MountedCamera {
-    MountedCamera {
-        camera: Camera {
-            lens: Lens::KannalaBrandt(KannalaBrandt {
-                fx: 1.0,
-                fy: 1.0,
-                cx: 0.0,
-                cy: 0.0,
-                radial: [0.0; 4],
-            }),
-            width: 1,
-            height: 1,
-            valid_radius: None,
-        },
-        T_device_camera: Isometry3::identity(),
+/// A row of poses; `None` where it is missing: not finite, or never filled.
+fn pose(path: &Path, row: usize, m: ArrayView2<f64>) -> Result<Option<Rigid>, SourceError> {
+    if m.iter().all(|v| *v == 0.0) {
+        return Ok(None);
+    }
+    let values = std::array::from_fn(|k| m[[k / 4, k % 4]]);
+    match rigid::from_row_major(&values) {
+        Ok(pose) => Ok(Some(pose)),
+        Err(PoseError::NotFinite) => Ok(None),
+        Err(error) => Err(SourceError::malformed(
+            path,
+            Place::Frame(row as u64),
+            error.to_string(),
+        )),
     }
 }
 

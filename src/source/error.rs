@@ -50,6 +50,9 @@ pub enum SourceError {
     /// A file or a part of it that is needed is not there.
     #[error("`{}`: {reason}", path.display())]
     Missing { path: PathBuf, reason: String },
+    /// Nothing of the kind that was looked for is here; something of another kind may be.
+    #[error("`{}`: {reason}", path.display())]
+    Absent { path: PathBuf, reason: String },
     /// An index beyond the end.
     #[error("clip {index} of `{source_name}`, which has {len}")]
     OutOfRange {
@@ -95,6 +98,14 @@ impl SourceError {
     /// Something needed is not there.
     pub fn missing(path: &Path, reason: impl Into<String>) -> Self {
         SourceError::Missing {
+            path: path.to_owned(),
+            reason: reason.into(),
+        }
+    }
+
+    /// Nothing of the kind that was looked for is there.
+    pub fn absent(path: &Path, reason: impl Into<String>) -> Self {
+        SourceError::Absent {
             path: path.to_owned(),
             reason: reason.into(),
         }

@@ -266,9 +266,6 @@ fn match_clocks(slam: &Trajectory, headset: &Track<Isometry3<f64>>) -> Option<Cl
             next += ahead;
             pairs.push((slam.first_rows[next].0, *time));
         }
-        if next >= slam.first_rows.len() {
-            break;
-        }
     }
     // The first of several headset rows on one SLAM row is the nearest.
     pairs.dedup_by_key(|pair| pair.0);
@@ -344,15 +341,4 @@ impl ColourFrames for Reclocked {
     ) -> Result<(), SourceError> {
         self.inner.read(indices, each)
     }
-}
-
-/// Participants whose recordings have no public ground truth.
-pub const WITHOUT_GROUND_TRUTH: [&str; 6] = ["P0004", "P0005", "P0006", "P0008", "P0016", "P0020"];
-
-/// Recordings of a split: `P0001` and `P0014` validate, those without ground truth are left out of both.
-#[must_use]
-pub fn is_validation(recording: &str) -> bool {
-    ["P0001", "P0014"]
-        .iter()
-        .any(|participant| recording.starts_with(participant))
 }

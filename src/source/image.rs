@@ -1,5 +1,6 @@
 //! Pictures in memory: decoding png and jpeg, quarter turns, and the resize and crop of every clip.
 
+use crate::formats::png::Picture;
 use ndarray::Array2;
 use zune_core::bytestream::ZCursor;
 use zune_core::colorspace::ColorSpace;
@@ -108,7 +109,7 @@ impl Image {
     /// # Errors
     /// A sentence that says what is wrong with the data.
     pub fn from_png(bytes: &[u8]) -> Result<Self, String> {
-        let (info, data) = read_png(bytes, png::Transformations::normalize_to_color8())?;
+        let (info, data) = read_png(bytes)?;
         let data = match info.color_type {
             png::ColorType::Rgb => data,
             png::ColorType::Rgba => data
@@ -233,25 +234,17 @@ impl SquareFit {
 /// # Errors
 /// A sentence that says what is wrong with the data.
 pub fn grey16_from_png(bytes: &[u8]) -> Result<Array2<u16>, String> {
-    let (info, data) = read_png(bytes, png::Transformations::IDENTITY)?;
-    if (info.color_type, info.bit_depth) != (png::ColorType::Grayscale, png::BitDepth::Sixteen) {
-        return Err("png: not 16-bit grey".to_owned());
+    match crate::formats::png::parse(bytes) {
+        Ok(Picture::Grey16(values)) => Ok(values),
+        Ok(_) => Err("png: not 16-bit grey".to_owned()),
+        Err(error) => Err(error.to_string()),
     }
-    let values = data
-        .chunks_exact(2)
-        .map(|pair| u16::from_be_bytes([pair[0], pair[1]]))
-        .collect();
-    Array2::from_shape_vec((info.height as usize, info.width as usize), values)
-        .map_err(|_| "png: incomplete picture".to_owned())
 }
 
-fn read_png(
-    bytes: &[u8],
-    transformations: png::Transformations,
-) -> Result<(png::OutputInfo, Vec<u8>), String> {
+fn read_png(bytes: &[u8]) -> Result<(png::OutputInfo, Vec<u8>), String> {
     let fail = |error: png::DecodingError| format!("png: {error}");
     let mut decoder = png::Decoder::new(std::io::Cursor::new(bytes));
-    decoder.set_transformations(transformations);
+    decoder.set_transformations(png::Transformations::normalize_to_color8());
     let header = decoder.read_header_info().map_err(fail)?;
     check_size(header.width, header.height)?;
     let mut reader = decoder.read_info().map_err(fail)?;

@@ -4,7 +4,7 @@
 use super::SourceError;
 use super::adt::{VrsColour, aria_gaze};
 use super::aria::vrs::image::Pictures;
-use super::aria::vrs::{StreamId, Vrs};
+use super::aria::vrs::{Kind, StreamId, Vrs};
 use super::aria::{calibration, hand_tracking, trajectory};
 use super::dataset::{Recordings, find};
 use super::error::Place;
@@ -117,9 +117,12 @@ pub fn open(folder: &Path) -> Result<Recording, SourceError> {
             .get("calib_json")
             .cloned()
             .map(|text| (video, text));
-        let pictures = Pictures::new(vrs, StreamId::RGB)?;
-        side = pictures.size().map_or(1408, |(width, _)| width);
-        recording.colour = Some(Box::new(VrsColour { pictures }));
+        // Recordings are also published without their image streams.
+        if vrs.of(StreamId::RGB, Kind::Data).next().is_some() {
+            let pictures = Pictures::new(vrs, StreamId::RGB)?;
+            side = pictures.size().map_or(1408, |(width, _)| width);
+            recording.colour = Some(Box::new(VrsColour { pictures }));
+        }
     }
     if let Some(path) = first(folder, &CALIBRATIONS) {
         recording.cameras = calibration::online(&path, side)?

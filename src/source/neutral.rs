@@ -11,7 +11,7 @@ mod manifest;
 
 use arrays::{joints, load, nanoseconds, poses, shape, track};
 use depth::depth;
-use lens::{lens_of, unknown_lens};
+use lens::lens_of;
 use manifest::{GazeUnit, JointFrameEntry, Manifest};
 
 use super::SourceError;
@@ -87,6 +87,13 @@ pub fn open(root: &Path) -> Result<Recording, SourceError> {
     let mut span: Option<(i64, i64)> = None;
 
     if let Some(entry) = &manifest.colour {
+        let wrong = |reason| SourceError::malformed(&path, Place::File, reason);
+        if !entry.turn.is_multiple_of(90) {
+            return Err(wrong(format!(
+                "`turn` is {} degrees, no multiple of 90",
+                entry.turn
+            )));
+        }
         recording.turn = Turn::from_degrees(entry.turn);
         let video = Video::open_with(
             root.join(&entry.file),
@@ -99,12 +106,19 @@ pub fn open(root: &Path) -> Result<Recording, SourceError> {
         let times = (0..video.info().frames)
             .map(|frame| start + (video.schedule().seconds(frame) * SECOND as f64).round() as i64)
             .collect();
-        let camera = match &entry.lens {
-            Some(lens) => lens_of(&path, lens)?,
-            // Without a lens only the size is known; nothing is projected through it.
-            None => unknown_lens(video.info().width, video.info().height),
-        };
-        if entry.lens.is_some() {
+        if let Some(lens) = &entry.lens {
+            let camera = lens_of(&path, lens)?;
+            let info = video.info();
+            if (camera.width, camera.height) != (info.width, info.height) {
+                return Err(wrong(format!(
+                    "`lens` is for pictures of {} x {} pixels, and those of `{}` have {} x {}",
+                    camera.width,
+                    camera.height,
+                    entry.file.display(),
+                    info.width,
+                    info.height
+                )));
+            }
             recording.cameras = vec![(
                 0,
                 MountedCamera {
@@ -141,13 +155,7 @@ pub fn open(root: &Path) -> Result<Recording, SourceError> {
         recording.device = Some(track(samples, &times));
         span = Some((times[0], times[times.len() - 1]));
         if recording.cameras.is_empty() {
-            recording.cameras = vec![(
-                0,
-                MountedCamera {
-                    camera: unknown_lens(1, 1),
-                    T_device_camera: Isometry3::identity(),
-                },
-            )];
+            recording.cameras = vec![(0, MountedCamera::without_lens())];
         }
     }
     if let Some(entry) = &manifest.gaze {

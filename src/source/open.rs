@@ -72,7 +72,7 @@ impl Dataset {
 /// folders of their own bring `declared` modalities with them.
 ///
 /// # Errors
-/// When nothing is found, or what is found cannot be opened.
+/// [`SourceError::Absent`] when nothing is found; another when what is found cannot be opened.
 pub fn open(
     path: &Path,
     kind: Option<Dataset>,
@@ -83,11 +83,11 @@ pub fn open(
         for kind in Dataset::ALL {
             match open(path, Some(kind), settings, declared) {
                 // Nothing of this kind is there: try the next.
-                Err(SourceError::Missing { .. }) => {}
+                Err(SourceError::Absent { .. }) => {}
                 other => return other,
             }
         }
-        return Err(SourceError::missing(
+        return Err(SourceError::absent(
             path,
             format!(
                 "no recordings found; kinds that are read: {}",
@@ -98,7 +98,7 @@ pub fn open(
     let settings = settings.clone();
     // A file is a video, whatever is asked.
     if path.is_file() && kind != Dataset::Video {
-        return Err(SourceError::missing(
+        return Err(SourceError::absent(
             path,
             "a file, not a folder of recordings",
         ));
@@ -113,7 +113,12 @@ pub fn open(
         Dataset::Egom2p => Arc::new(egom2p::Arrays::open(path, None, None, settings)?),
         Dataset::Video => {
             if path.is_dir() {
-                folder::list(path)?;
+                match folder::list(path) {
+                    Err(SourceError::Missing { path, reason }) => {
+                        return Err(SourceError::Absent { path, reason });
+                    }
+                    listed => listed?,
+                };
             }
             Arc::new(VideoClips::open(path, settings)?)
         }
@@ -142,6 +147,7 @@ impl VideoClips {
             .collect();
         let mut recording = Recording::new("video", &name);
         recording.colour = Some(Box::new(Frames { video, times }));
+        recording.check(&settings)?;
         Ok(VideoClips {
             recording,
             settings,

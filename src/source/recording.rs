@@ -20,7 +20,7 @@ use super::{DropReason, Outcome};
 use crate::clip::clock::{CLIP_SECONDS, SIGNAL_RATE, SIGNAL_SAMPLES};
 use crate::clip::frames::{gravity_frame_of, joints_in_camera, joints_in_frame};
 use crate::clip::{Clip, JointTrack};
-use crate::geometry::camera::Camera;
+use crate::geometry::camera::{Camera, KannalaBrandt, Lens};
 use crate::geometry::undistortion::Remap;
 use nalgebra::{Isometry3, Rotation3, Unit, UnitQuaternion, Vector3};
 use ndarray::Array2;
@@ -68,6 +68,28 @@ pub struct MountedCamera {
     /// For the pictures as stored.
     pub camera: Camera,
     pub T_device_camera: Isometry3<f64>,
+}
+
+impl MountedCamera {
+    /// A stand-in where only poses are known: one pixel, and a fisheye, so that no pinhole intrinsics come out of it.
+    #[must_use]
+    pub fn without_lens() -> Self {
+        MountedCamera {
+            camera: Camera {
+                lens: Lens::KannalaBrandt(KannalaBrandt {
+                    fx: 1.0,
+                    fy: 1.0,
+                    cx: 0.0,
+                    cy: 0.0,
+                    radial: [0.0; 4],
+                }),
+                width: 1,
+                height: 1,
+                valid_radius: None,
+            },
+            T_device_camera: Isometry3::identity(),
+        }
+    }
 }
 
 /// One recording. Times are nanoseconds on one clock, whichever the adapter chose.
@@ -160,6 +182,22 @@ impl Recording {
             body: None,
             remap: OnceLock::new(),
         }
+    }
+
+    /// Whether clips can be cut as `settings` ask.
+    ///
+    /// # Errors
+    /// When pictures shall be undistorted whose lens is not known.
+    pub fn check(&self, settings: &CutSettings) -> Result<(), SourceError> {
+        let lens = self.cameras.first().map(|(_, mounted)| &mounted.camera);
+        let known = lens.is_some_and(|lens| *lens != MountedCamera::without_lens().camera);
+        if settings.undistort.is_some() && self.colour.is_some() && !known {
+            return Err(SourceError::Settings(format!(
+                "`undistort` needs a lens, and `{}/{}` has none",
+                self.source, self.id
+            )));
+        }
+        Ok(())
     }
 
     /// First and last moment.

@@ -188,7 +188,7 @@ impl ShardClips {
     /// # Errors
     /// When there are none, or a tar is damaged.
     pub fn open(root: &Path) -> Result<Self, SourceError> {
-        let missing = || SourceError::missing(root, "there are no shards of clips here");
+        let absent = || SourceError::absent(root, "there are no shards of clips here");
         let mut sets = Vec::new();
         for split in SPLITS {
             let folder = root.join(split);
@@ -199,8 +199,8 @@ impl ShardClips {
         if sets.is_empty() && holds_shards(root) {
             sets.push((String::new(), ClipSet::open(root)?));
         }
-        let first = sets.first().ok_or_else(missing)?;
-        let id = first.1.ids().first().ok_or_else(missing)?;
+        let first = sets.first().ok_or_else(absent)?;
+        let id = first.1.ids().first().ok_or_else(absent)?;
         Ok(ShardClips {
             name: id.split('/').next().unwrap_or("clips").to_owned(),
             format: described_format(root),

@@ -30,7 +30,7 @@ pub struct Survey {
 /// Looks at `most` clips spread over `source` (or all) on all cores, keeping `examples` of them. Damaged clips are counted.
 ///
 /// # Errors
-/// When there are no clips, or none of them can be made.
+/// When the source does not say the sizes of its clips and its first ones cannot be made, or it has none.
 pub fn survey(
     source: &dyn Source,
     most: Option<usize>,

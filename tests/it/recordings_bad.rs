@@ -368,6 +368,104 @@ fn a_wrong_manifest_names_its_line_and_the_key() {
     assert!(error.contains("[75, 22, 3]"), "{error}");
 }
 
+/// The neutral recording with a part of its manifest replaced, and what opening it says.
+fn refused(part: &str, replacement: &str, settings: CutSettings) -> String {
+    let folder = tempfile::tempdir().unwrap();
+    neutral_folder(folder.path(), 30.0, 0.0);
+    let path = folder.path().join("recording.yaml");
+    let text = std::fs::read_to_string(&path).unwrap();
+    assert!(text.contains(part));
+    std::fs::write(&path, text.replace(part, replacement)).unwrap();
+    let empty = NpyArray::from(&ndarray::Array3::<f32>::zeros((60, 0, 0)));
+    reviv::formats::npy::write(&folder.path().join("empty.npy"), &empty).unwrap();
+    neutral::source(folder.path(), settings)
+        .unwrap_err()
+        .to_string()
+}
+
+#[test]
+fn a_lens_that_is_unknown_or_of_another_size_a_slanted_turn_and_empty_depth_are_refused() {
+    let undistort = CutSettings {
+        undistort: Some(90.0),
+        ..small()
+    };
+    let said = refused("name: one", "name: lensless", undistort);
+    assert_eq!(
+        said,
+        "`undistort` needs a lens, and `mine/lensless` has none"
+    );
+    let lens = "lens: {model: pinhole, parameters: [50, 50, 48, 32], size: [192, 128]}";
+    let said = refused("file: rgb.mp4", &format!("file: rgb.mp4, {lens}"), small());
+    assert!(
+        said.contains("192 x 128") && said.contains("96 x 64"),
+        "{said}"
+    );
+    let said = refused("file: rgb.mp4", "file: rgb.mp4, turn: 45", small());
+    assert!(said.contains("45 degrees"), "{said}");
+    let said = refused(
+        "depth: {file: signals.npz, key: depth,",
+        "depth: {file: empty.npy,",
+        small(),
+    );
+    assert!(
+        said.contains("empty.npy") && said.contains("[60, 0, 0]"),
+        "{said}"
+    );
+}
+
+#[test]
+fn a_recording_that_lacks_a_part_is_an_error_and_not_another_kind() {
+    let look = |folder: &Path| match reviv::source::open::open(folder, None, &small(), &[]) {
+        Ok(source) => panic!("opened as `{}`", source.name()),
+        Err(error) => error,
+    };
+    let nothing = tempfile::tempdir().unwrap();
+    assert!(matches!(look(nothing.path()), SourceError::Absent { .. }));
+    // A neutral recording whose pictures are not there.
+    let folder = tempfile::tempdir().unwrap();
+    neutral_folder(folder.path(), 30.0, 0.0);
+    std::fs::create_dir(folder.path().join("frames")).unwrap();
+    let path = folder.path().join("recording.yaml");
+    let text = std::fs::read_to_string(&path).unwrap();
+    std::fs::write(&path, text.replace("rgb.mp4", "frames")).unwrap();
+    let error = look(folder.path());
+    assert!(matches!(error, SourceError::Missing { .. }), "{error}");
+    // An ADT sequence without its factory calibration.
+    let folder = tempfile::tempdir().unwrap();
+    let vrs = small_vrs().finish(true, true);
+    std::fs::write(folder.path().join("video.vrs"), vrs).unwrap();
+    std::fs::write(folder.path().join("aria_trajectory.csv"), "").unwrap();
+    let error = look(folder.path()).to_string();
+    assert!(error.contains("calib_json"), "{error}");
+}
+
+#[test]
+fn poses_of_the_ancestors_are_missing_where_they_are_zero_and_refused_where_they_are_none() {
+    let root = tempfile::tempdir().unwrap();
+    let folder = root.path().join("cam/holoassist");
+    std::fs::create_dir_all(&folder).unwrap();
+    let clip = |bad: f64| {
+        let mut poses =
+            ndarray::Array3::from_shape_fn((60, 4, 4), |(_, r, c)| f64::from(u8::from(r == c)));
+        for row in 27..34 {
+            poses.index_axis_mut(ndarray::Axis(0), row).fill(0.0);
+        }
+        for k in 0..3 {
+            poses[[40, k, k]] = bad;
+        }
+        reviv::formats::npy::write(&folder.join("a.npy"), &NpyArray::from(&poses)).unwrap();
+        let source = egom2p::Arrays::open(root.path(), None, None, small()).unwrap();
+        source.clip(0).map(|outcome| outcome.into_clip().unwrap())
+    };
+    let camera = clip(1.0).unwrap().camera.unwrap();
+    assert!(camera.valid[26] && !camera.valid[30] && camera.valid[34]);
+    let error = clip(1e160).unwrap_err().to_string();
+    assert!(
+        error.contains("a.npy") && error.contains("frame 40"),
+        "{error}"
+    );
+}
+
 #[test]
 fn the_ancestors_arrays_and_tokens_are_read() {
     let root = tempfile::tempdir().unwrap();

@@ -258,6 +258,44 @@ fn every_start_gives_the_frames_that_playing_from_the_beginning_gives() {
     }
 }
 
+/// So many frames with gaps cannot be named one by one on a command line.
+#[test]
+fn thousands_of_chosen_frames_come_through_ffmpeg() {
+    if !ffmpeg::available() {
+        eprintln!("skipped: no ffmpeg on the PATH");
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("long.mkv");
+    let made = std::process::Command::new("ffmpeg")
+        .args(["-v", "error", "-f", "lavfi", "-i"])
+        .arg("testsrc=size=32x32:rate=30,trim=end_frame=2400")
+        .args(["-c:v", "ffv1"])
+        .arg(&path)
+        .status();
+    if !made.is_ok_and(|status| status.success()) {
+        eprintln!("skipped: this ffmpeg makes no video");
+        return;
+    }
+    let video = Video::open(&path).unwrap();
+    let read = |frames: Vec<usize>| -> Vec<_> {
+        let frames = video.chosen(frames).unwrap();
+        frames.map(|frame| frame.unwrap()).collect()
+    };
+    let sparse: Vec<usize> = (1..2400).step_by(2).collect();
+    let many = read(sparse.clone());
+    assert_eq!(
+        many.iter().map(|frame| frame.index).collect::<Vec<_>>(),
+        sparse
+    );
+    // The same frames as when few are named.
+    let few = read(vec![1, 1201, 2399]);
+    for (found, at) in few.iter().zip([0, 600, 1199]) {
+        assert!(*found == many[at], "frame {}", found.index);
+    }
+    assert!(many[0].image != many[600].image);
+}
+
 #[test]
 fn a_video_of_variable_rate_is_chosen_from_by_time() {
     let video = Video::open(own("synthetic_variable.mp4")).unwrap();

@@ -113,8 +113,9 @@ impl<'a> Literal<'a> {
             Some(b'\'' | b'"') => Ok(Value::Text(self.string()?)),
             Some(b'(') => self.tuple(),
             Some(b'[') => {
-                // A record type: skip it, the caller says that it is not read.
-                self.at = self.text.rfind(']').unwrap_or(self.at) + 1;
+                // A record type: skip to its last bracket, never back; the caller says that it is not read.
+                let rest = &self.text[self.at..];
+                self.at += rest.rfind(']').map_or(rest.len(), |end| end + 1);
                 Ok(Value::Other)
             }
             _ => {

@@ -293,6 +293,8 @@ mod tests {
                 "does not fit",
             ),
             ("__import__('os').system('true')", "dictionary"),
+            // The only closing bracket lies before the opening one.
+            ("{'],\"a\":[':[", "dictionary"),
         ] {
             let error = parse(&file(header, b"1234")).unwrap_err().to_string();
             assert!(error.contains(part), "{header}: {error}");

@@ -30,7 +30,8 @@ impl<W: Write> ZipWriter<W> {
     /// Adds a member.
     ///
     /// # Errors
-    /// When the name was used before, or archive or member reach 4 GB (zip64 is read, but not written).
+    /// When the name was used before or is longer than 4096 bytes, there are 65534 members already, the archive would reach 4 GB
+    /// (zip64 is read, but not written), or writing fails.
     pub fn add(&mut self, name: &str, bytes: &[u8]) -> Result<(), FormatError> {
         let mut crc = flate2::Crc::new();
         crc.update(bytes);

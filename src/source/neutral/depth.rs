@@ -50,10 +50,15 @@ pub(super) fn depth(root: &Path, entry: &DepthEntry) -> Result<Box<dyn DepthFram
             entry.rate,
             entry.times.as_deref(),
         )?;
-        (
-            DepthFiles::Array(array.to_dim::<f32, ndarray::Ix3>()?),
-            times,
-        )
+        let array = array.to_dim::<f32, ndarray::Ix3>()?;
+        if array.is_empty() {
+            return Err(SourceError::malformed(
+                &path,
+                Place::File,
+                format!("depth maps without pixels, of shape {:?}", array.shape()),
+            ));
+        }
+        (DepthFiles::Array(array), times)
     };
     Ok(Box::new(NeutralDepth {
         files,

@@ -55,19 +55,3 @@ pub(super) fn lens_of(path: &Path, entry: &LensEntry) -> Result<Camera, SourceEr
         valid_radius: None,
     })
 }
-
-/// A stand-in where only poses matter: its lens is a fisheye, so that no pinhole intrinsics come out of it.
-pub(super) fn unknown_lens(width: u32, height: u32) -> Camera {
-    Camera {
-        lens: Lens::KannalaBrandt(KannalaBrandt {
-            fx: 1.0,
-            fy: 1.0,
-            cx: 0.0,
-            cy: 0.0,
-            radial: [0.0; 4],
-        }),
-        width,
-        height,
-        valid_radius: None,
-    }
-}

@@ -69,8 +69,8 @@ impl Recording {
         let mut squares = Vec::with_capacity(distinct.len());
         let mut depths = Vec::with_capacity(distinct.len());
         // One picture at a time: full-size pictures are not held.
-        colour.read(&distinct, &mut |frame, picture| {
-            squares.push(self.square(picture, colour.times()[frame], settings).data);
+        colour.read(&distinct, &mut |_, picture| {
+            squares.push(self.square(picture, settings).data);
         })?;
         if squares.len() != distinct.len() {
             return Err(SourceError::Settings(format!(
@@ -83,7 +83,7 @@ impl Recording {
             for &frame in &distinct {
                 let time = colour.times()[frame];
                 let near = nearest(depth.times(), time).unwrap_or(0);
-                depths.push(self.square_depth(&depth.read(near)?, time, settings));
+                depths.push(self.square_depth(&depth.read(near)?, settings));
             }
         }
         let find = |frame: usize| distinct.binary_search(&frame).unwrap_or(0);
@@ -113,8 +113,9 @@ impl Recording {
     }
 
     /// The undistortion map for pictures `side` pixels wide; made from the first calibration and kept.
-    pub(super) fn remap(&self, time: i64, angle: f64, side: u32) -> Option<Arc<Remap>> {
-        let mounted = self.mounted(time)?;
+    pub(super) fn remap(&self, angle: f64, side: u32) -> Option<Arc<Remap>> {
+        // Not that of the picture's own time: which picture asks first depends on the threads.
+        let (_, mounted) = self.cameras.first()?;
         Some(Arc::clone(self.remap.get_or_init(|| {
             Arc::new(Remap::new(
                 &mounted.camera,
@@ -128,10 +129,10 @@ impl Recording {
         settings.side * 3
     }
 
-    pub(super) fn square(&self, picture: Image, time: i64, settings: &CutSettings) -> Image {
+    pub(super) fn square(&self, picture: Image, settings: &CutSettings) -> Image {
         let picture = match settings
             .undistort
-            .and_then(|angle| self.remap(time, angle, Self::fine_side(settings)))
+            .and_then(|angle| self.remap(angle, Self::fine_side(settings)))
         {
             Some(remap) => Image {
                 width: remap.size().0 as u32,
@@ -143,16 +144,11 @@ impl Recording {
         picture.turned(self.turn).square(settings.side)
     }
 
-    pub(super) fn square_depth(
-        &self,
-        metres: &Array2<f32>,
-        time: i64,
-        settings: &CutSettings,
-    ) -> Vec<f32> {
+    pub(super) fn square_depth(&self, metres: &Array2<f32>, settings: &CutSettings) -> Vec<f32> {
         let remapped;
         let metres = match settings
             .undistort
-            .and_then(|angle| self.remap(time, angle, Self::fine_side(settings)))
+            .and_then(|angle| self.remap(angle, Self::fine_side(settings)))
         {
             Some(remap) => {
                 let (width, height) = remap.size();

@@ -70,7 +70,7 @@ impl Schedule {
         }
     }
 
-    /// The frame shown nearest to `at` seconds; the earlier one of two equally near.
+    /// The frame shown nearest to `at` seconds; of two equally near the even one, or the earlier one where the rate varies.
     pub fn nearest(&self, at: f64) -> usize {
         let last = self.frames().saturating_sub(1);
         match self {

@@ -184,8 +184,8 @@ impl Wanted {
                     return Err(SourceError::unsupported(
                         &self.index.path,
                         format!(
-                            "the embedded decoder does not know `{what}` (frame {rank}); {}",
-                            super::INSTALL_FFMPEG
+                            "the embedded decoder does not know `{what}` (frame {rank}); set `decoder: ffmpeg`, or {}",
+                            super::CONVERT
                         ),
                     ));
                 }

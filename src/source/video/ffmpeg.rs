@@ -9,8 +9,13 @@ use std::io::{BufRead, BufReader, Read};
 use std::path::{Path, PathBuf};
 use std::process::{Child, ChildStdout, Command, Stdio};
 use std::sync::OnceLock;
+use std::thread::JoinHandle;
 
 const MOST_PIXELS: usize = 64_000_000;
+/// Bytes of what ffmpeg complains about that are kept, the last ones.
+const COMPLAINTS: usize = 1 << 16;
+/// More frames than this are not named one by one: Linux takes no argument of more than 128 KiB.
+const MOST_NAMED: usize = 1000;
 
 /// Whether there is an `ffmpeg` to call; asked once per process.
 pub fn available() -> bool {
@@ -107,14 +112,44 @@ fn complaint(stderr: &[u8]) -> String {
     }
 }
 
+/// Reads to the end and keeps the last [`COMPLAINTS`] bytes.
+fn last_bytes(mut pipe: impl Read) -> Vec<u8> {
+    let mut kept = Vec::new();
+    let mut block = [0; 4096];
+    loop {
+        match pipe.read(&mut block) {
+            Ok(0) => return kept,
+            Ok(read) => kept.extend_from_slice(&block[..read]),
+            Err(cause) if cause.kind() == std::io::ErrorKind::Interrupted => {}
+            Err(_) => return kept,
+        }
+        kept.drain(..kept.len().saturating_sub(COMPLAINTS));
+    }
+}
+
+/// The filter that lets only `frames` through, counted from `first`; none where every frame is wanted or too many are.
+fn filter(frames: &[usize], first: usize, last: usize) -> Option<String> {
+    let every = frames.len() == last - first + 1;
+    (!every && frames.len() <= MOST_NAMED).then(|| {
+        let named = frames
+            .iter()
+            .map(|frame| format!("eq(n\\,{})", frame - first));
+        format!("select={}", named.collect::<Vec<_>>().join("+"))
+    })
+}
+
 /// The wanted frames, decoded and turned upright by `ffmpeg`.
 #[derive(Debug)]
 pub struct Wanted {
     path: PathBuf,
     child: Child,
     pipe: BufReader<ChildStdout>,
+    /// Reads what ffmpeg complains about all along: it stops when nobody does.
+    complaints: Option<JoinHandle<Vec<u8>>>,
     frames: Vec<usize>,
     delivered: usize,
+    /// The frame that comes next out of the pipe; none where only wanted ones come.
+    coming: Option<usize>,
 }
 
 impl Wanted {
@@ -132,18 +167,17 @@ impl Wanted {
             let early = f64::midpoint(schedule.seconds(first), schedule.seconds(first - 1));
             seek = vec!["-ss".to_owned(), format!("{:.6}", index.first + early)];
         }
-        let dense = frames.len() == last - first + 1;
         let mut command = command(&index.path, &seek);
-        if !dense {
-            let list: Vec<String> = frames
-                .iter()
-                .map(|frame| format!("eq(n\\,{})", frame - first))
-                .collect();
-            command.args(["-vf", &format!("select={}", list.join("+"))]);
-        }
+        let (count, coming) = match filter(&frames, first, last) {
+            Some(filter) => {
+                command.args(["-vf", &filter]);
+                (frames.len().max(1), None)
+            }
+            None => (last - first + 1, Some(first)),
+        };
         command
             .args(["-fps_mode", "passthrough", "-frames:v"])
-            .arg(frames.len().max(1).to_string())
+            .arg(count.to_string())
             .args(["-pix_fmt", "rgb24", "-c:v", "ppm", "-f", "image2pipe", "-"])
             .stdout(Stdio::piped());
         let mut child = command
@@ -153,13 +187,31 @@ impl Wanted {
             .stdout
             .take()
             .ok_or_else(|| SourceError::unsupported(&index.path, "ffmpeg gave no pipe"))?;
+        let stderr = child.stderr.take();
+        let complaints = stderr.map(|pipe| std::thread::spawn(move || last_bytes(pipe)));
         Ok(Wanted {
             path: index.path.clone(),
             child,
             pipe: BufReader::with_capacity(1 << 16, pipe),
+            complaints,
             frames,
             delivered: 0,
+            coming,
         })
+    }
+
+    /// The picture of `frame`; those that come before it are left out.
+    fn picture(&mut self, frame: usize) -> Result<Option<Image>, String> {
+        loop {
+            let image = self.read()?;
+            let Some(coming) = &mut self.coming else {
+                return Ok(image);
+            };
+            *coming += 1;
+            if *coming > frame || image.is_none() {
+                return Ok(image);
+            }
+        }
     }
 
     fn read(&mut self) -> Result<Option<Image>, String> {
@@ -199,11 +251,10 @@ impl Wanted {
     }
 
     fn failure(&mut self, frame: usize, reason: &str) -> SourceError {
-        let mut stderr = Vec::new();
         let _ = self.child.kill();
-        if let Some(pipe) = self.child.stderr.take() {
-            let _ = pipe.take(1 << 16).read_to_end(&mut stderr);
-        }
+        let complaints = self.complaints.take();
+        let stderr = complaints.and_then(|thread| thread.join().ok());
+        let stderr = stderr.unwrap_or_default();
         SourceError::malformed(
             &self.path,
             Place::Frame(frame as u64),
@@ -218,7 +269,7 @@ impl Iterator for Wanted {
     fn next(&mut self) -> Option<Self::Item> {
         let frame = *self.frames.get(self.delivered)?;
         self.delivered += 1;
-        Some(match self.read() {
+        Some(match self.picture(frame) {
             Ok(Some(image)) => Ok((frame, image)),
             Ok(None) => {
                 self.delivered = self.frames.len();
@@ -236,5 +287,27 @@ impl Drop for Wanted {
     fn drop(&mut self) {
         let _ = self.child.kill();
         let _ = self.child.wait();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn all_complaints_are_read_and_the_last_of_them_kept() {
+        let said = [vec![b'a'; 3 * COMPLAINTS], b"the end".to_vec()].concat();
+        let kept = last_bytes(said.as_slice());
+        assert_eq!(kept.len(), COMPLAINTS);
+        assert!(kept.ends_with(b"aathe end"));
+        assert_eq!(last_bytes(&b"short"[..]), b"short");
+    }
+
+    #[test]
+    fn frames_are_named_only_where_they_are_few_and_have_gaps() {
+        assert_eq!(filter(&[4, 6], 4, 6).unwrap(), "select=eq(n\\,0)+eq(n\\,2)");
+        assert_eq!(filter(&[4, 5, 6], 4, 6), None);
+        let many: Vec<usize> = (0..=MOST_NAMED).map(|k| 2 * k).collect();
+        assert_eq!(filter(&many, 0, 2 * MOST_NAMED), None);
     }
 }

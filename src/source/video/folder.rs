@@ -31,6 +31,8 @@ pub fn list(folder: &Path) -> Result<Vec<PathBuf>, SourceError> {
             "there are no png or jpg pictures in this folder",
         ));
     }
+    // By name first: `f1` and `f01` are the same number, and the folder lists them in any order.
+    files.sort();
     files.sort_by_cached_key(|path| natural_key(path));
     Ok(files)
 }

@@ -18,13 +18,13 @@ use super::SourceError;
 use super::error::Place;
 use super::image::Image;
 use crate::clip::Rgb;
-use ndarray::{Array3, Array4, Axis};
+use ndarray::{Array3, Array4};
 use std::fs::File;
 use std::io::Read;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-const INSTALL_FFMPEG: &str = "with `ffmpeg` on the PATH it can be read; or convert it: `ffmpeg -i IN -pix_fmt yuv420p OUT.mp4`";
+const CONVERT: &str = "convert it: `ffmpeg -i IN -pix_fmt yuv420p OUT.mp4`";
 
 /// How to read a video.
 #[derive(Debug, Clone, PartialEq, serde::Serialize, serde::Deserialize, schemars::JsonSchema)]
@@ -171,7 +171,7 @@ impl Video {
             };
             return Err(SourceError::unsupported(
                 path,
-                format!("{what}; {INSTALL_FFMPEG}"),
+                format!("{what}; with `ffmpeg` on the PATH it can be read; or {CONVERT}"),
             ));
         }
         Self::open_ffmpeg(path)
@@ -396,15 +396,4 @@ pub fn to_array(image: &Image) -> Array3<u8> {
     let shape = (image.height as usize, image.width as usize, 3);
     Array3::from_shape_vec(shape, image.data.clone())
         .expect("an image holds height x width x 3 bytes")
-}
-
-/// One frame of a clip.
-#[must_use]
-pub fn clip_frame(rgb: &Rgb, index: usize) -> Image {
-    let frame = rgb.frames.index_axis(Axis(0), index);
-    Image {
-        width: frame.shape()[1] as u32,
-        height: frame.shape()[0] as u32,
-        data: frame.iter().copied().collect(),
-    }
 }

@@ -30,9 +30,6 @@ pub struct Track {
     pub codec: [u8; 4],
     /// The payload of `avcC`, when there is one.
     pub avc_configuration: Option<Vec<u8>>,
-    /// Coded size in pixels.
-    pub width: u32,
-    pub height: u32,
     /// Degrees clockwise by which the decoded picture has to be turned for display: 0, 90, 180 or 270.
     pub rotation: u32,
     /// Ticks per second of [`Sample::time`].

@@ -63,7 +63,7 @@ pub fn build(rng: &mut StreamRng) -> Scene {
         }
         scene = attempt(rng);
     }
-    // An unusable room is empty: one can still walk and look.
+    // In an unusable room nothing is in the way: the furniture stays to be looked at, and one walks through it.
     scene.obstacles.clear();
     scene.spots.truncate(0);
     scene.spots.push(Spot {

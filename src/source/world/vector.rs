@@ -62,10 +62,6 @@ impl V3 {
     pub fn abs(self) -> Self {
         v3(self.x.abs(), self.y.abs(), self.z.abs())
     }
-    #[inline]
-    pub fn max_component(self) -> f32 {
-        self.x.max(self.y).max(self.z)
-    }
 }
 
 impl Add for V3 {

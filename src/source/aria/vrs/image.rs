@@ -189,7 +189,7 @@ impl Pictures {
         let row = width.checked_mul(pixel).ok_or("too wide")?;
         let stride = if stride == 0 { row } else { stride };
         let size = stride.checked_mul(height);
-        if row == 0 || stride < row || size.is_none_or(|size| size > content.len()) {
+        if row == 0 || height == 0 || stride < row || size.is_none_or(|size| size > content.len()) {
             return Err(format!(
                 "{width} x {height} raw pixels do not fit into {} bytes",
                 content.len()

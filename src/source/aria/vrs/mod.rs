@@ -22,7 +22,7 @@ const MAGIC: [u8; 8] = *b"VisionRe";
 const MAGIC_END: [u8; 4] = *b"cord";
 const FILE_HEADER: u64 = 80;
 const RECORD_HEADER: u64 = 32;
-/// Largest uncompressed record that is read: four times the largest picture of any Aria stream.
+/// Payload of the largest record that is read, uncompressed: four times the largest picture of any Aria stream.
 const MOST_UNCOMPRESSED: u64 = 64 << 20;
 /// Zstd frames ask for a window of memory; Aria's compressor asks for at most 8 MiB.
 const ZSTD_WINDOW: u64 = 64 << 20;
@@ -39,9 +39,8 @@ pub struct StreamId {
 impl StreamId {
     /// Aria's colour camera.
     pub const RGB: StreamId = StreamId::new(214, 1);
-    /// Aria's left and right tracking cameras.
+    /// The left tracking camera of Aria and Quest.
     pub const SLAM_LEFT: StreamId = StreamId::new(1201, 1);
-    pub const SLAM_RIGHT: StreamId = StreamId::new(1201, 2);
     /// The map from the device's clock to the studio's timecode.
     pub const TIMECODE: StreamId = StreamId::new(285, 2);
 
@@ -209,6 +208,10 @@ impl Vrs {
     /// # Errors
     /// When it is damaged or larger than any picture.
     pub fn read(&self, entry: &Entry) -> Result<Record, SourceError> {
+        if u64::from(entry.size) > MOST_UNCOMPRESSED + self.record_header {
+            let reason = format!("a record of {} bytes", entry.size);
+            return Err(self.damaged(entry.offset, reason));
+        }
         self.read_prefix(entry, MOST_UNCOMPRESSED)
     }
 
@@ -297,10 +300,10 @@ impl Vrs {
             .map_err(|reason| self.damaged(record.entry.offset, reason))
     }
 
-    /// The value of a string field in a stream's first configuration record.
+    /// A stream's first configuration record and its layout.
     ///
     /// # Errors
-    /// When the stream has no configuration record.
+    /// When the stream has no configuration record, does not describe it, or it is damaged.
     pub fn configuration(&self, stream: StreamId) -> Result<(Layout, Record), SourceError> {
         let entry = *self.of(stream, Kind::Configuration).next().ok_or_else(|| {
             SourceError::missing(

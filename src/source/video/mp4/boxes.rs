@@ -169,8 +169,6 @@ impl Boxes<'_> {
         let mut track = Track {
             codec: *b"    ",
             avc_configuration: None,
-            width: 0,
-            height: 0,
             rotation,
             timescale,
             samples: Vec::new(),
@@ -216,9 +214,7 @@ impl Boxes<'_> {
             return Err(self.damaged(stsd.at, "`stsd` describes nothing"));
         };
         track.codec = entry.kind;
-        // 6 reserved, 2 reference index, 16 predefined, then 16-bit width and height; extensions start at 78.
-        track.width = u32::from(be16(entry.data, 24).unwrap_or(0));
-        track.height = u32::from(be16(entry.data, 26).unwrap_or(0));
+        // Extensions start at 78.
         if let Some(rest) = entry.data.get(78..) {
             // Trailing bytes that are no box do occur here: look for `avcC` only as far as boxes go.
             let mut here = 0;
@@ -238,10 +234,6 @@ impl Boxes<'_> {
         }
         Ok(())
     }
-}
-
-pub(super) fn be16(data: &[u8], at: usize) -> Option<u16> {
-    Some(u16::from_be_bytes(data.get(at..at + 2)?.try_into().ok()?))
 }
 
 pub(super) fn be32(data: &[u8], at: usize) -> Option<u32> {
