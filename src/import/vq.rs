@@ -52,7 +52,8 @@ pub fn plan(checkpoint: &Checkpoint, heads: Option<usize>) -> Result<Plan, Strin
         ref other => return Err(format!("`quantize._codebook.embed` has shape {other:?}")),
     };
     let heads = heads.unwrap_or(HEADS);
-    if heads == 0 || !width.is_multiple_of(heads) {
+    // Zero is a multiple of every number.
+    if width == 0 || heads == 0 || !width.is_multiple_of(heads) {
         return Err(format!("width {width} does not divide into {heads} heads"));
     }
     let mut rules = Vec::with_capacity(entries.len());
@@ -198,4 +199,23 @@ fn modality(checkpoint: &Checkpoint) -> Result<&'static str, String> {
         .ok_or_else(|| {
             "a tokenizer that does not say for what; put `cam`, `gaze`, `body`, `lhand` or `rhand` into the file's name".to_owned()
         })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_model_of_no_width_is_refused() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("cam.safetensors");
+        let header = r#"{"encoder.conv.weight":{"dtype":"F32","shape":[0,9,2],"data_offsets":[0,0]},"quantize._codebook.embed":{"dtype":"F32","shape":[2,1],"data_offsets":[0,8]}}"#;
+        let mut bytes = (header.len() as u64).to_le_bytes().to_vec();
+        bytes.extend(header.as_bytes());
+        bytes.extend([0; 8]);
+        std::fs::write(&path, bytes).unwrap();
+        let checkpoint = Checkpoint::open(&path).unwrap();
+        let error = plan(&checkpoint, None).unwrap_err();
+        assert_eq!(error, "width 0 does not divide into 12 heads");
+    }
 }

@@ -172,7 +172,8 @@ fn draw(canvas: &mut Canvas, clip: &Clip, mut y: usize) {
         canvas.text(MARGIN, y, name, FAINT);
         let all = Array1::from(valid);
         for x in 0..width {
-            let share = all[x * all.len() / width];
+            // A signal of no samples has none that is valid.
+            let share = all.get(x * all.len() / width).copied().unwrap_or(0.0);
             let mixed = std::array::from_fn(|c| {
                 (f64::from(INVALID[c]) * (1.0 - share) + f64::from(VALID[c]) * share).round() as u8
             });
@@ -214,15 +215,14 @@ fn hand(
     place: &impl Fn(f64, f64) -> Option<[f64; 2]>,
 ) {
     let sample = (seconds * track.rate).round() as usize;
-    if sample >= track.joints.shape()[0] {
-        return;
-    }
+    // Nothing beyond the end of the track, and no joint that it does not have.
     let pixel = |joint: usize| {
-        let at = |c: usize| f64::from(track.joints[(sample, joint, c)]);
-        if !track.valid[(sample, joint)] || at(2) <= 0.02 {
+        let at = |c: usize| Some(f64::from(*track.joints.get((sample, joint, c))?));
+        let (x, y, z) = (at(0)?, at(1)?, at(2)?);
+        if track.valid.get((sample, joint)) != Some(&true) || z <= 0.02 {
             return None;
         }
-        let (u, v) = (k.fx * at(0) / at(2) + k.cx, k.fy * at(1) / at(2) + k.cy);
+        let (u, v) = (k.fx * x / z + k.cx, k.fy * y / z + k.cy);
         place(
             (u + 0.5) / f64::from(k.width),
             (v + 0.5) / f64::from(k.height),
@@ -232,5 +232,49 @@ fn hand(
         if let (Some(a), Some(b)) = (pixel(a), pixel(b)) {
             canvas.line(a, b, 1.6, colour);
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::clip::{CameraTrack, Rgb};
+    use ndarray::{Array2, Array3, Array4};
+
+    #[test]
+    fn tracks_without_samples_and_hands_with_few_joints_are_drawn() {
+        let mut clip = Clip::empty("short", "test");
+        clip.rgb = Some(Rgb {
+            rate: 8.0,
+            frames: Array4::zeros((1, 8, 8, 3)),
+        });
+        clip.camera = Some(CameraTrack {
+            rate: 30.0,
+            T_world_camera: Vec::new(),
+            valid: Vec::new(),
+            up_world: None,
+            intrinsics: Some(Intrinsics {
+                fx: 4.0,
+                fy: 4.0,
+                cx: 3.5,
+                cy: 3.5,
+                width: 8,
+                height: 8,
+            }),
+        });
+        let hand = |joints| JointTrack {
+            rate: 30.0,
+            joints: Array3::from_shape_fn((1, joints, 3), |(_, j, c)| match c {
+                2 => 1.0,
+                _ => 0.1 * j as f32,
+            }),
+            valid: Array2::from_elem((1, joints), true),
+        };
+        let without = contact_sheet(std::slice::from_ref(&clip));
+        clip.left_hand = Some(hand(0));
+        clip.right_hand = Some(hand(5));
+        let with = contact_sheet(&[clip]);
+        assert_eq!(with.size().0, without.size().0);
+        assert!(with.size().1 > without.size().1);
     }
 }

@@ -150,6 +150,8 @@ fn bones(skeleton: &Skeleton, radius: f32) -> Vec<(usize, usize, f32)> {
 }
 
 fn blob(out: &mut impl Write, name: &str, bytes: &[u8]) -> Result<(), ViewError> {
+    // Names of modalities come from the folder of a model.
+    let name = escape(name);
     write!(out, "<script type=\"text/plain\" id=\"blob-{name}\">")?;
     let mut encoder = EncoderWriter::new(&mut *out, &STANDARD);
     encoder.write_all(bytes)?;
@@ -159,8 +161,10 @@ fn blob(out: &mut impl Write, name: &str, bytes: &[u8]) -> Result<(), ViewError>
     Ok(())
 }
 
+/// For text and for attributes in double quotes.
 fn escape(text: &str) -> String {
     text.replace('&', "&amp;")
         .replace('<', "&lt;")
         .replace('>', "&gt;")
+        .replace('"', "&quot;")
 }

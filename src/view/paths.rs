@@ -6,7 +6,8 @@ use super::contact::{LEFT, RIGHT};
 use crate::clip::frames::gravity_frame_of;
 use crate::clip::{CameraTrack, Clip, JointTrack};
 use crate::geometry::skeleton::BODY;
-use nalgebra::{Isometry3, Matrix3, Point3, Rotation3, UnitQuaternion, Vector3};
+use crate::reconstruction::stitch::level_camera;
+use nalgebra::{Isometry3, Point3, Vector3};
 
 /// Side of one drawing.
 const SIDE: usize = 400;
@@ -55,14 +56,12 @@ fn camera_in_level_frame(camera: &CameraTrack) -> (Vec<Option<Look>>, bool) {
     let first = camera.valid.iter().position(|v| *v).unwrap_or(0);
     let T_level_world = level.unwrap_or_else(|| {
         // Gravity is not known: the first picture is taken as upright.
-        let axes = Matrix3::new(1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, -1.0, 0.0);
-        let turn = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(axes));
         let T_world_first = camera
             .T_world_camera
             .get(first)
             .copied()
             .unwrap_or_default();
-        Isometry3::from_parts(Vector3::zeros().into(), turn) * T_world_first.inverse()
+        level_camera() * T_world_first.inverse()
     });
     let of = |(pose, valid): (&Isometry3<f64>, &bool)| {
         let pose = T_level_world * pose;

@@ -173,6 +173,15 @@ fn bombs() -> Vec<(&'static str, Vec<u8>, &'static str)> {
         &b"h\x00".repeat(1000),
         b"eu.",
     ];
+    // A hundred thousand pairs whose keys are not text.
+    let pairs = [
+        b"\x80\x02Nq\x000}(",
+        &model[..],
+        &text(b"args"),
+        b"}(",
+        &b"h\x00".repeat(200_000),
+        b"uu.",
+    ];
     let mut deep = b"\x80\x02".to_vec();
     deep.extend(b"}(X\x01\x00\x00\x00a".repeat(100_000));
     deep.extend(b"N");
@@ -191,6 +200,7 @@ fn bombs() -> Vec<(&'static str, Vec<u8>, &'static str)> {
         ),
         ("names", archive(&keys), "name of 1048576 bytes"),
         ("texts", archive(&list.concat()), "too large"),
+        ("pairs", archive(&pairs.concat()), "too large"),
     ]
 }
 
@@ -230,6 +240,10 @@ fn absurd_headers_of_safetensors_are_refused() {
         format!(r#"{{"w":{{"dtype":"F32","shape":{shape},"data_offsets":[{from},{to}]}}}}"#)
     };
     assert!(open(&file(&entry("[2,3]", 0, 24), 24)).is_ok());
+    let empty = entry("[0,1099511627776,1099511627776]", 0, 0);
+    assert!(open(&file(&empty, 0)).is_ok());
+    let mixed = r#"{"mean":{"dtype":"F32","shape":[6],"data_offsets":[0,24]},"step":{"dtype":"I64","shape":[1],"data_offsets":[24,32]}}"#;
+    assert!(open(&file(mixed, 32)).is_ok());
     for (header, values, part) in [
         (entry("[2,3]", 0, 24), 20, "not valid"),
         (entry("[4294967296,4294967296]", 0, 24), 24, "not valid"),

@@ -109,9 +109,13 @@ fn scene() -> Scene {
 
 #[test]
 fn the_page_is_one_file_and_keeps_hostile_text_inside() {
+    let mut scene = scene();
+    scene.confidence[0].name = "a\"><script>b".into();
     let mut page = Vec::new();
-    write_page(&scene(), &mut page).unwrap();
+    write_page(&scene, &mut page).unwrap();
     let page = String::from_utf8(page).unwrap();
+    assert!(!page.contains("><script>b"));
+    assert!(page.contains("id=\"blob-confidence-a&quot;&gt;&lt;script&gt;b\""));
     assert!(!page.contains("http://") && !page.contains("https://") && !page.contains("src="));
     assert!(!page.contains("</script><b>"));
     assert!(!page.contains("{{"));

@@ -1,7 +1,7 @@
 //! Which entries share memory, and whether they may.
 
 use super::Entry;
-use crate::import::pickle::TensorView;
+use crate::import::pickle::{Scalar, TensorView};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// More tensors than any model has.
@@ -9,13 +9,16 @@ pub(super) const MAX_ENTRIES: usize = 1 << 17;
 /// The longest name of a tensor in bytes.
 pub(super) const MAX_NAME: usize = 512;
 
+/// Storage, type of the elements, offset, shape and strides of a view.
+type Place = (String, Scalar, u64, Vec<u64>, Vec<u64>);
+
 /// Marks entries that are the same view, and refuses tensors that overlap otherwise.
 pub(super) fn identify(
     tensors: Vec<(String, TensorView)>,
     memory: u64,
 ) -> Result<Vec<Entry>, String> {
     let mut names = BTreeSet::new();
-    let mut owners: BTreeMap<(String, u64, Vec<u64>, Vec<u64>), usize> = BTreeMap::new();
+    let mut owners: BTreeMap<Place, usize> = BTreeMap::new();
     let mut entries = Vec::with_capacity(tensors.len());
     let mut claimed = 0u64;
     for (index, (name, view)) in tensors.into_iter().enumerate() {
@@ -27,6 +30,7 @@ pub(super) fn identify(
         }
         let key = (
             view.storage.key.clone(),
+            view.storage.scalar,
             view.offset,
             view.shape.clone(),
             view.strides.clone(),
@@ -47,12 +51,15 @@ pub(super) fn identify(
             "the tensors overlap: they claim {claimed} bytes of {memory}"
         ));
     }
+    // In bytes: views of one storage may have elements of different sizes.
     let mut spans: Vec<(&str, u64, u64, &str)> = entries
         .iter()
-        .filter(|e| e.same_as.is_none() && e.view.is_contiguous() && e.view.elements() > 0)
+        .filter(|e| e.same_as.is_none() && e.view.elements() > 0 && e.view.is_contiguous())
         .map(|e| {
             let key = e.view.storage.key.as_str();
-            (key, e.view.offset, e.view.end(), e.name.as_str())
+            let width = e.scalar().width() as u64;
+            let (start, end) = (e.view.offset * width, e.view.end() * width);
+            (key, start, end, e.name.as_str())
         })
         .collect();
     spans.sort_unstable();
@@ -64,4 +71,54 @@ pub(super) fn identify(
         }
     }
     Ok(entries)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::import::pickle::Storage;
+
+    /// A line of elements in one storage of 64 bytes.
+    fn line(name: &str, scalar: Scalar, offset: u64, length: u64) -> (String, TensorView) {
+        let view = TensorView {
+            storage: Storage {
+                key: String::new(),
+                scalar,
+                elements: 64 / scalar.width() as u64,
+            },
+            offset,
+            shape: vec![length],
+            strides: vec![1],
+        };
+        (name.to_owned(), view)
+    }
+
+    #[test]
+    fn places_of_different_types_are_compared_in_bytes() {
+        // Bytes 0..32 and 32..40: in elements 0..8 and 4..5.
+        let apart = vec![
+            line("mean", Scalar::F32, 0, 8),
+            line("step", Scalar::I64, 4, 1),
+        ];
+        let entries = identify(apart, 64).unwrap();
+        assert!(entries.iter().all(|e| e.same_as.is_none()));
+        // Bytes 16..20 and 32..40: in elements both 4..5.
+        let alike = vec![line("a", Scalar::F32, 4, 1), line("b", Scalar::I64, 4, 1)];
+        assert_eq!(identify(alike, 64).unwrap()[1].same_as, None);
+        // Bytes 0..36 and 32..40: in elements 0..9 and 4..5.
+        let over = vec![line("a", Scalar::F32, 0, 9), line("b", Scalar::I64, 4, 1)];
+        assert_eq!(identify(over, 64).unwrap_err(), "`a` and `b` overlap");
+        let same = vec![line("a", Scalar::F32, 4, 1), line("b", Scalar::F32, 4, 1)];
+        assert_eq!(identify(same, 64).unwrap()[1].same_as, Some(0));
+    }
+
+    #[test]
+    fn a_tensor_without_elements_has_no_place() {
+        let mut empty = line("empty", Scalar::F32, 0, 0);
+        empty.1.shape = vec![0, 1 << 40, 1 << 40];
+        empty.1.strides = vec![1, 1 << 40, 1];
+        assert!(empty.1.is_contiguous());
+        let entries = identify(vec![empty, line("a", Scalar::F32, 0, 16)], 64).unwrap();
+        assert_eq!(entries[1].same_as, None);
+    }
 }

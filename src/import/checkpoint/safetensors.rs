@@ -81,9 +81,10 @@ fn view(entry: &Value, available: u64) -> Option<TensorView> {
         && end <= available
         && elements.checked_mul(width) == Some(end - begin)
         && begin.is_multiple_of(width);
-    let mut strides = vec![1; shape.len()];
+    let mut strides = vec![1u64; shape.len()];
     for axis in (1..shape.len()).rev() {
-        strides[axis - 1] = strides[axis] * shape[axis].max(1);
+        // Saturates only where there are no elements.
+        strides[axis - 1] = strides[axis].saturating_mul(shape[axis].max(1));
     }
     fits.then(|| TensorView {
         storage: Storage {

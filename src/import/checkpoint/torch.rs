@@ -17,6 +17,9 @@ const MAX_DEPTH: usize = 64;
 const MAX_OTHERS: usize = 1000;
 /// Bytes of text in the `args` of a checkpoint.
 const MAX_ARGUMENTS: usize = 1 << 20;
+/// Values and pairs in the `args` of a checkpoint.
+const MAX_PLAIN: usize = 1 << 16;
+const TOO_LARGE: &str = "its `args` are nested too deeply or too large";
 
 impl Checkpoint {
     pub(super) fn archive(path: &Path, file: File) -> Result<Self, ImportError> {
@@ -208,8 +211,8 @@ impl Plain<'_> {
         if let Some(text) = self.pickle.text(id) {
             self.text += text.len();
         }
-        if depth > 8 || self.visits > 1 << 16 || self.text > MAX_ARGUMENTS {
-            return Err("its `args` are nested too deeply or too large".to_owned());
+        if depth > 8 || self.visits > MAX_PLAIN || self.text > MAX_ARGUMENTS {
+            return Err(TOO_LARGE.to_owned());
         }
         Ok(match self.pickle.node(id) {
             Node::Bool(value) => (*value).into(),
@@ -227,6 +230,11 @@ impl Plain<'_> {
             Node::Dict(_) | Node::Object { .. } => {
                 let mut map = Map::new();
                 for (key, value) in self.pickle.pairs(id) {
+                    // A key that is not text leads to no value, but must be looked at.
+                    self.visits += 1;
+                    if self.visits > MAX_PLAIN {
+                        return Err(TOO_LARGE.to_owned());
+                    }
                     if let Some(key) = self.pickle.text(*key) {
                         self.text += key.len();
                         let value = self.value(*value, depth + 1)?;

@@ -167,11 +167,11 @@ impl<'a> Machine<'a> {
                 0x93 => {
                     let (name, module) = (self.pop()?, self.pop()?);
                     let (Node::Text(module), Node::Text(name)) =
-                        (self.node(module).clone(), self.node(name).clone())
+                        (self.node(module), self.node(name))
                     else {
                         return self.refuse("a global whose name is not text");
                     };
-                    let global = self.global(&module, &name)?;
+                    let global = self.global(module, name)?;
                     self.push(Node::Global(global));
                 }
                 b'R' => self.reduce()?,

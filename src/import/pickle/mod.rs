@@ -84,6 +84,8 @@ const MAX_TEXT: usize = 1 << 20;
 /// Keys of storages, codes of NumPy types and the bytes of NumPy numbers: names can be called on the same text again and
 /// again, so what a call copies is short.
 const MAX_COPIED: usize = 64;
+/// Module and name of a global: a TorchScript class keeps both.
+const MAX_GLOBAL: usize = 256;
 
 impl Pickle {
     /// Reads a pickle.
@@ -233,6 +235,7 @@ mod tests {
         assert!(call(b"c_codecs\nencode\n", b"X\x06\x00\x00\x00latin1\x86R.").contains("65536"));
         let storage = b"(X\x07\x00\x00\x00storagectorch\nFloatStorage\n";
         assert!(call(storage, b"NK\x01tQ.").contains("65536"));
+        assert!(call(b"X\x09\x00\x00\x00__torch__", b"\x93.").contains("65545 bytes"));
         // A call with a thousand arguments.
         let mut wide = b"ctorch._utils\n_rebuild_tensor_v2\n(".to_vec();
         wide.extend(std::iter::repeat_n(b'N', 1000));

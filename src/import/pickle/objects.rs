@@ -1,11 +1,15 @@
 //! What may be built: the allow-list of names, and what a call of each of them describes. Nothing is ever called.
 
 use super::machine::Machine;
-use super::{Global, Id, MAX_COPIED, Node, PickleError, Scalar, Storage, TensorView};
+use super::{Global, Id, MAX_COPIED, MAX_GLOBAL, Node, PickleError, Scalar, Storage, TensorView};
 
 impl Machine<'_> {
     /// The allow-list.
     pub(super) fn global(&self, module: &str, name: &str) -> Result<Global, PickleError> {
+        let length = module.len() + name.len();
+        if length > MAX_GLOBAL {
+            return self.refuse(format!("a global whose name has {length} bytes"));
+        }
         Ok(match (module, name) {
             ("collections", "OrderedDict") => Global::OrderedDict,
             ("argparse", "Namespace") => Global::Namespace,

@@ -1,7 +1,7 @@
 // Every failure is shown on the page and kept for the self-test.
 const errors = [];
-addEventListener("error", e => errors.push(String(e.message)));
-addEventListener("unhandledrejection", e => errors.push(String(e.reason)));
+addEventListener("error", e => report(String(e.message)));
+addEventListener("unhandledrejection", e => report(String(e.reason)));
 
 // Data: the manifest and its binary blobs. All positions are metres in the world of the manifest (z up).
 

@@ -208,7 +208,7 @@ function frame(now) {
   requestAnimationFrame(frame);
 }
 if (!gl) report("This browser has no WebGL2: the 3D scene cannot be drawn. Video, gaze and numbers are shown.");
-if (main && pose(main, 0)) state.target = add(pose(main, Math.floor(samples / 2)).p, [0, 0.4, -0.6]);
+const middle = main && pose(main, Math.floor(samples / 2)); if (middle) state.target = add(middle.p, [0, 0.4, -0.6]);
 setCamera("orbit"); addEventListener("resize", drawConfidence); drawConfidence();
 const start = /[#&]t=([\d.]+)/.exec(location.hash); if (start) seek(+start[1] * rate);
 if (/[#&]camera=(\w+)/.test(location.hash)) setCamera(/[#&]camera=(\w+)/.exec(location.hash)[1]);
