@@ -200,18 +200,6 @@ impl Fisheye624 {
         (values.iter().all(|v| v.is_finite()) && fx > 0.0 && fy > 0.0).then_some(lens)
     }
 
-    /// The radially distorted angle of an angle to the optical axis, and its derivative.
-    fn distorted_angle(&self, theta: f64) -> (f64, f64) {
-        let square = theta * theta;
-        let (mut power, mut value, mut slope) = (1.0, 1.0, 1.0);
-        for (i, k) in self.radial.iter().enumerate() {
-            power *= square;
-            value += k * power;
-            slope += k * power * (2 * i + 3) as f64;
-        }
-        (theta * value, slope)
-    }
-
     /// Tangential and thin-prism terms on the radially distorted point.
     fn decentred(&self, q: &Vector2<f64>) -> Vector2<f64> {
         let [p0, p1] = self.tangential;
@@ -247,7 +235,7 @@ impl Fisheye624 {
         let ray = Vector2::new(p.x / p.z, p.y / p.z);
         let r = ray.norm();
         let stretch = if r > 1e-12 {
-            self.distorted_angle(r.atan()).0 / r
+            radial(&self.radial, r.atan()).0 / r
         } else {
             1.0
         };
@@ -278,29 +266,18 @@ impl Fisheye624 {
         if radius < 1e-12 {
             return Some(Vector3::new(q.x, q.y, 1.0));
         }
-        let theta = invert_angle(radius, |theta| self.distorted_angle(theta))?;
+        let theta = invert_angle(radius, |theta| radial(&self.radial, theta))?;
         ray_at(theta, &(q / radius))
     }
 }
 
 impl KannalaBrandt {
-    fn distorted_angle(&self, theta: f64) -> (f64, f64) {
-        let square = theta * theta;
-        let (mut power, mut value, mut slope) = (1.0, 1.0, 1.0);
-        for (i, k) in self.radial.iter().enumerate() {
-            power *= square;
-            value += k * power;
-            slope += k * power * (2 * i + 3) as f64;
-        }
-        (theta * value, slope)
-    }
-
     fn project(&self, p: &Vector3<f64>) -> Option<Vector2<f64>> {
         let radius = p.x.hypot(p.y);
         if radius < 1e-12 {
             return (p.z > 0.0).then(|| Vector2::new(self.cx, self.cy));
         }
-        let (angle, _) = self.distorted_angle(radius.atan2(p.z));
+        let (angle, _) = radial(&self.radial, radius.atan2(p.z));
         Some(Vector2::new(
             self.fx * angle * p.x / radius + self.cx,
             self.fy * angle * p.y / radius + self.cy,
@@ -313,9 +290,21 @@ impl KannalaBrandt {
         if radius < 1e-12 {
             return Some(Vector3::new(q.x, q.y, 1.0));
         }
-        let theta = invert_angle(radius, |theta| self.distorted_angle(theta))?;
+        let theta = invert_angle(radius, |theta| radial(&self.radial, theta))?;
         ray_at(theta, &(q / radius))
     }
+}
+
+/// The radially distorted angle of an angle to the optical axis, and its derivative.
+fn radial(terms: &[f64], theta: f64) -> (f64, f64) {
+    let square = theta * theta;
+    let (mut power, mut value, mut slope) = (1.0, 1.0, 1.0);
+    for (i, k) in terms.iter().enumerate() {
+        power *= square;
+        value += k * power;
+        slope += k * power * (2 * i + 3) as f64;
+    }
+    (theta * value, slope)
 }
 
 /// The angle whose distorted value is `radius`.

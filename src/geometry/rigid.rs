@@ -1,14 +1,10 @@
-//! Rigid (SE(3)) and similarity (Sim(3)) transforms: aliases of nalgebra's types and what they lack.
+//! Rigid transforms (SE(3)): nalgebra's type and what it lacks.
 
 use super::rotation;
-use nalgebra::{
-    Isometry3, Matrix3, Matrix4, Point3, Similarity3, Translation3, UnitQuaternion, Vector3,
-};
+use nalgebra::{Isometry3, Matrix3, Matrix4, Translation3};
 
 /// A rigid transform, `T_to_from`.
 pub type Rigid = Isometry3<f64>;
-/// A rotation, translation and scale: `x' = s R x + t`.
-pub type Sim3 = Similarity3<f64>;
 
 /// How far a matrix may be from a rotation (largest entry of `RᵀR - 1`) to be read as one.
 const ROTATION_TOLERANCE: f64 = 1e-3;
@@ -76,28 +72,10 @@ pub fn interpolate(a: &Rigid, b: &Rigid, t: f64) -> Rigid {
     )
 }
 
-/// A similarity from its parts; `None` unless `scale` is finite and positive.
-pub fn similarity(
-    scale: f64,
-    rotation: UnitQuaternion<f64>,
-    translation: Vector3<f64>,
-) -> Option<Sim3> {
-    (scale.is_finite() && scale > 0.0)
-        .then(|| Sim3::from_parts(translation.into(), rotation, scale))
-}
-
-/// A pose moved by a similarity: the position is scaled, the rotation only turned.
-pub fn apply_to_pose(sim: &Sim3, pose: &Rigid) -> Rigid {
-    let position = sim * Point3::from(pose.translation.vector);
-    Rigid::from_parts(
-        position.coords.into(),
-        sim.isometry.rotation * pose.rotation,
-    )
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use nalgebra::Vector3;
 
     fn pose() -> Rigid {
         Rigid::new(Vector3::new(1.0, -2.0, 0.5), Vector3::new(0.3, -1.1, 0.7))
@@ -137,15 +115,5 @@ mod tests {
         let half = interpolate(&a, &b, 0.5);
         let mid = (a.translation.vector + b.translation.vector) / 2.0;
         assert!((half.translation.vector - mid).norm() < 1e-12);
-    }
-
-    #[test]
-    fn a_similarity_scales_positions_and_turns_poses() {
-        let sim = similarity(2.0, pose().rotation, Vector3::new(0.0, 0.0, 1.0)).unwrap();
-        let moved = apply_to_pose(&sim, &pose());
-        let expected = 2.0 * (pose().rotation * pose().translation.vector) + Vector3::z();
-        assert!((moved.translation.vector - expected).norm() < 1e-12);
-        assert!(similarity(0.0, pose().rotation, Vector3::zeros()).is_none());
-        assert!(similarity(f64::NAN, pose().rotation, Vector3::zeros()).is_none());
     }
 }

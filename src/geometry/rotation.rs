@@ -50,11 +50,6 @@ pub fn slerp(a: &UnitQuaternion<f64>, b: &UnitQuaternion<f64>, t: f64) -> UnitQu
         .unwrap_or(if t < 0.5 { *a } else { *b })
 }
 
-/// The angle between two rotations, radians in [0, pi].
-pub fn angle(a: &UnitQuaternion<f64>, b: &UnitQuaternion<f64>) -> f64 {
-    a.angle_to(b)
-}
-
 /// The rotation nearest to a 3x3 matrix in the Frobenius norm (by SVD); `None` where the matrix is not finite or singular.
 pub fn nearest(matrix: &Matrix3<f64>) -> Option<UnitQuaternion<f64>> {
     if !matrix.iter().all(|v| v.is_finite()) {
@@ -122,10 +117,10 @@ mod tests {
     #[test]
     fn slerp_moves_at_constant_angular_speed() {
         let (a, b) = (random_rotation(3), random_rotation(4));
-        let whole = angle(&a, &b);
+        let whole = a.angle_to(&b);
         for step in 0..=10 {
             let t = f64::from(step) / 10.0;
-            assert!((angle(&a, &slerp(&a, &b, t)) - t * whole).abs() < 1e-7);
+            assert!((a.angle_to(&slerp(&a, &b, t)) - t * whole).abs() < 1e-7);
         }
     }
 

@@ -131,12 +131,7 @@ impl Skeleton {
     }
 }
 
-/// `common[i] = ours[HAND_TO_COMMON[i]]`, where common is wrist, then thumb, index, middle, ring, pinky, knuckle to tip.
-pub const HAND_TO_COMMON: [usize; JOINTS] = [
-    0, 13, 14, 15, 16, 1, 2, 3, 17, 4, 5, 6, 18, 10, 11, 12, 19, 7, 8, 9, 20,
-];
-
-/// `ours[i] = common[HAND_FROM_COMMON[i]]`.
+/// `ours[i] = common[HAND_FROM_COMMON[i]]`, where common is wrist, then thumb, index, middle, ring, pinky, knuckle to tip.
 pub const HAND_FROM_COMMON: [usize; JOINTS] = [
     0, 5, 6, 7, 9, 10, 11, 17, 18, 19, 13, 14, 15, 1, 2, 3, 4, 8, 12, 16, 20,
 ];
@@ -146,25 +141,16 @@ pub const BODY_FROM_SMPL22: [usize; JOINTS] = [
     0, 1, 2, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21,
 ];
 
-/// The 22-joint SMPL pose of ours; `spine1` is a copy of the pelvis, as in the authors' tools.
-pub fn body_to_smpl22(pose: &[[f64; 3]; JOINTS]) -> [[f64; 3]; 22] {
-    let mut out = [pose[0]; 22];
-    for (ours, &theirs) in BODY_FROM_SMPL22.iter().enumerate() {
-        out[theirs] = pose[ours];
-    }
-    out
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn hand_permutations_are_inverse_and_keep_names_together() {
-        for i in 0..JOINTS {
-            assert_eq!(HAND_FROM_COMMON[HAND_TO_COMMON[i]], i);
+    fn the_common_order_of_a_hand_goes_finger_by_finger_from_knuckle_to_tip() {
+        let mut common = [""; JOINTS];
+        for (name, at) in HAND.joints.into_iter().zip(HAND_FROM_COMMON) {
+            common[at] = name;
         }
-        let common: Vec<&str> = HAND_TO_COMMON.iter().map(|&i| HAND.joints[i]).collect();
         assert_eq!(
             common[1..9],
             [
@@ -225,11 +211,10 @@ mod tests {
     }
 
     #[test]
-    fn smpl_gets_its_first_spine_joint_back() {
-        let pose = std::array::from_fn(|j| [j as f64, 0.0, 0.0]);
-        let smpl = body_to_smpl22(&pose);
-        assert_eq!(smpl[3], pose[0]);
-        assert_eq!(smpl[20], pose[BODY.joint("left_wrist").unwrap()]);
-        assert_eq!(smpl[10], pose[BODY.joint("left_foot").unwrap()]);
+    fn the_body_is_smpl_without_its_first_spine_joint() {
+        assert!(!BODY_FROM_SMPL22.contains(&3));
+        assert!(BODY_FROM_SMPL22.is_sorted());
+        assert_eq!(BODY_FROM_SMPL22[BODY.joint("left_wrist").unwrap()], 20);
+        assert_eq!(BODY_FROM_SMPL22[BODY.joint("left_foot").unwrap()], 10);
     }
 }

@@ -1,4 +1,4 @@
-//! The camera trajectory as 60 x 9: poses relative to the first, two rotation columns then translation (model reference 1.2).
+//! The camera trajectory as 60 x 9: poses relative to the first, two rotation columns then translation.
 
 use super::{ClipFormat, Modality, ModalityError, Shape, expect_shape};
 use crate::clip::{CameraTrack, Clip, Signal};

@@ -1,4 +1,4 @@
-//! Gaze as a point of the upright square image over time, 60 x 2 (model reference 1.2).
+//! Gaze as a point of the upright square image over time, 60 x 2.
 
 use super::{ClipFormat, Modality, ModalityError, Shape, expect_shape};
 use crate::clip::{Clip, GazeTrack, Signal};

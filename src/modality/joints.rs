@@ -1,4 +1,4 @@
-//! Body and hands as 60 x 21 x 3 joints (model reference 1.2, 1.3).
+//! Body and hands as 60 x 21 x 3 joints.
 
 use super::{ClipFormat, Modality, ModalityError, Shape, expect_shape};
 use crate::clip::{Clip, JointTrack, Signal};

@@ -1,4 +1,4 @@
-//! Colour and depth as video in [-1, 1] (model reference 1.2).
+//! Colour and depth as video in [-1, 1].
 
 use super::{ClipFormat, Modality, ModalityError, Shape, expect_shape};
 use crate::clip::depth_video::{self, DepthCoding};
