@@ -12,9 +12,11 @@ use crate::experiment::catalog::Catalog;
 use crate::experiment::load;
 use crate::geometry::alignment::Freedom;
 use crate::run::RunDirectory;
+use crate::run::cache::Key;
 use crate::run::execute::cache_of;
 use crate::run::files::read_json;
 use crate::run::schedule::Schedule;
+use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
@@ -34,7 +36,7 @@ pub struct Compare {
     #[arg(long, value_delimiter = ',', value_name = "COLUMN")]
     columns: Vec<String>,
     /// Confidence level of the intervals
-    #[arg(long, default_value_t = 0.95, value_name = "SHARE")]
+    #[arg(long, default_value_t = 0.95, value_name = "SHARE", value_parser = level)]
     level: f64,
     /// Published rows below the table, as context; `reviv list published` shows the names
     #[arg(long, value_name = "NAME")]
@@ -64,9 +66,15 @@ impl super::Run for Compare {
         if let Some([reference, estimate]) = self.trajectory.as_deref() {
             return self.trajectories(terminal, reference, estimate);
         }
+        let mut settings = CompareSettings {
+            baseline: self.baseline,
+            columns: self.columns,
+            ..CompareSettings::default()
+        };
+        settings.interval.level = self.level;
         let mut entrants: Vec<Entrant> = Vec::new();
         for name in &self.runs {
-            let mut found = entrants_of(name, &self.place)?;
+            let mut found = entrants_of(name, &self.place, &settings.columns)?;
             for entrant in &mut found {
                 if entrants.iter().any(|e| e.label == entrant.label) {
                     entrant.label = format!("{name}/{}", entrant.label);
@@ -74,12 +82,6 @@ impl super::Run for Compare {
             }
             entrants.extend(found);
         }
-        let mut settings = CompareSettings {
-            baseline: self.baseline,
-            columns: self.columns,
-            ..CompareSettings::default()
-        };
-        settings.interval.level = self.level;
         let against = self.against.as_deref().map(|name| {
             published(&Catalog::linked(), Path::new("./x"), name).ok_or_else(|| {
                 Failure::input(
@@ -105,6 +107,16 @@ impl super::Run for Compare {
             terminal.data(render(&table, format));
         }
         Ok(())
+    }
+}
+
+/// A confidence level, within the bounds that `compare:` of a sweep has.
+fn level(text: &str) -> Result<f64, String> {
+    let level: f64 = text.parse().map_err(|_| "not a number".to_owned())?;
+    if (0.5..=0.9999).contains(&level) {
+        Ok(level)
+    } else {
+        Err("a level is a share from 0.5 to 0.9999, for instance `0.95`".to_owned())
     }
 }
 
@@ -194,7 +206,10 @@ fn numbers(errors: &TrajectoryErrors) -> serde_json::Value {
 }
 
 /// The rows that `name` stands for: a scores file, a folder with one, or a run.
-pub fn entrants_of(name: &str, runs: &Path) -> Result<Vec<Entrant>, Failure> {
+///
+/// Stages of a run that score nothing of `columns` are left out, if another of its stages does: a table of depth has no row
+/// for scores of hands, which may be of other clips.
+pub fn entrants_of(name: &str, runs: &Path, columns: &[String]) -> Result<Vec<Entrant>, Failure> {
     let path = Path::new(name);
     let read = |path: &Path| {
         Scores::read(path)
@@ -218,14 +233,28 @@ pub fn entrants_of(name: &str, runs: &Path) -> Result<Vec<Entrant>, Failure> {
             .iter()
             .any(|work| work.key == key && work.kind == "scores")
     };
-    let mut entrants: Vec<Entrant> = Vec::new();
+    let mut found: BTreeMap<Key, Scores> = BTreeMap::new();
     let mut missing = 0;
+    let all = schedule.cells.iter().flat_map(|cell| &cell.stages);
+    for (_, key) in all.filter(|(_, key)| is_scores(*key)) {
+        if found.contains_key(key) {
+            continue;
+        }
+        let folder = cache.path(key);
+        if folder.join(FILE).is_file() {
+            found.insert(*key, read(&folder)?);
+        } else {
+            missing += 1;
+        }
+    }
+    let any = found.values().any(|scores| scores.has(columns));
+    let is_row = |key: &Key| {
+        let asked = |scores: &Scores| !any || scores.has(columns);
+        is_scores(*key) && found.get(key).is_none_or(asked)
+    };
+    let mut entrants: Vec<Entrant> = Vec::new();
     for cell in &schedule.cells {
-        let scored: Vec<_> = cell
-            .stages
-            .iter()
-            .filter(|(_, key)| is_scores(*key))
-            .collect();
+        let scored: Vec<_> = cell.stages.iter().filter(|(_, key)| is_row(key)).collect();
         for (stage, key) in &scored {
             let arm = if schedule.sweep {
                 cell.arm.clone()
@@ -237,12 +266,9 @@ pub fn entrants_of(name: &str, runs: &Path) -> Result<Vec<Entrant>, Failure> {
             } else {
                 arm
             };
-            let folder = cache.path(key);
-            if !folder.join(FILE).is_file() {
-                missing += 1;
+            let Some(scores) = found.get(key).cloned() else {
                 continue;
-            }
-            let scores = read(&folder)?;
+            };
             match entrants.iter_mut().find(|e| e.label == label) {
                 Some(entrant) => entrant.seeds.push(scores),
                 None => entrants.push(Entrant {
@@ -256,7 +282,10 @@ pub fn entrants_of(name: &str, runs: &Path) -> Result<Vec<Entrant>, Failure> {
         let (message, help) = if missing > 0 {
             (
                 format!("run `{name}` has not finished its scores"),
-                format!("continue it with `reviv run {}`", schedule.name),
+                run.read().map_or_else(
+                    |_| "continue it with `reviv run FILE`".to_owned(),
+                    |run| format!("continue it with `reviv run {}`", run.experiment),
+                ),
             )
         } else {
             (
@@ -267,4 +296,17 @@ pub fn entrants_of(name: &str, runs: &Path) -> Result<Vec<Entrant>, Failure> {
         return Err(Failure::input(message, help));
     }
     Ok(entrants)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::level;
+
+    #[test]
+    fn a_level_is_a_share_and_not_a_percentage() {
+        assert_eq!(level("0.95"), Ok(0.95));
+        for text in ["95", "0", "1", "nan", "-0.5", "much"] {
+            assert!(level(text).is_err(), "{text}");
+        }
+    }
 }

@@ -7,10 +7,8 @@ mod synthesize;
 use super::run::{interruptible, progress};
 use super::terminal::{Failure, Terminal};
 use crate::experiment::catalog::Catalog;
-use crate::experiment::diagnostic::Span;
-use crate::experiment::load::beside;
+use crate::experiment::load;
 use crate::experiment::registry::Registry;
-use crate::experiment::source::Sources;
 use crate::ops::clips::SourceSettings;
 use crate::source::convert::{ConvertSettings, Converted, convert};
 use crate::source::open::{Dataset, open};
@@ -95,29 +93,22 @@ impl Cut {
 /// The settings of a registry entry of kind `source`.
 fn source_entry(name: &str) -> Result<SourceSettings, Failure> {
     let catalog = Catalog::linked();
-    let mut registry = Registry::new(&catalog, beside(Path::new("./x"), "registry").as_deref());
-    let (mut sources, mut problems) = (Sources::default(), Vec::new());
-    if registry.text("source", name).is_none() {
+    let here = Path::new("./x");
+    let registry = Registry::new(&catalog, load::beside(here, "registry").as_deref());
+    let Some(text) = registry.text("source", name) else {
         let names = registry.names("source").join(", ");
         return Err(Failure::input(
             format!("there is no file, no folder and no registry source `{name}`"),
             format!("registry sources: {names}"),
         ));
-    }
-    let node = registry.settings(
-        "source",
-        name,
-        Span::point(0, 0),
-        &mut sources,
-        &mut problems,
-    );
-    let Some(node) = node else {
+    };
+    let Some(settings) = load::entry(&catalog, here, "source", name) else {
         return Err(Failure::input(
-            format!("the registry source `{name}` cannot be read"),
-            format!("`reviv show source/{name}` shows it"),
+            format!("the registry source `{name}` has mistakes"),
+            format!("`reviv check {}` shows them", text.place),
         ));
     };
-    SourceSettings::deserialize(node.to_json()).map_err(|error| {
+    SourceSettings::deserialize(settings).map_err(|error| {
         Failure::input(
             format!("the registry source `{name}`: {error}"),
             format!("`reviv show source/{name}` shows its settings"),

@@ -34,7 +34,7 @@ impl super::Run for List {
     fn run(self, terminal: &Terminal) -> Result<(), Failure> {
         let catalog = Catalog::linked();
         let registry = Registry::new(&catalog, beside(Path::new("./x"), "registry").as_deref());
-        for (_, message) in &registry.problems {
+        for (_, message, _) in &registry.problems {
             terminal.note(format_args!("warning: {message}\n"));
         }
         let mut lines = Vec::new();

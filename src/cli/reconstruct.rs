@@ -17,6 +17,8 @@ use std::path::{Path, PathBuf};
 const EXPERIMENT: &str = include_str!("../../experiments/reconstruct.yaml");
 const FILE: &str = "experiments/reconstruct.yaml";
 const STAGE: &str = "reconstruction";
+/// What lists the files of a result.
+const MANIFEST: &str = "manifest.json";
 
 /// Reconstruct the wearer and the world from one video
 ///
@@ -99,16 +101,10 @@ impl Reconstruct {
             let stem = self.video.file_stem().unwrap_or_default().to_string_lossy();
             PathBuf::from(format!("{stem}_reconstruction"))
         });
-        let taken = target.exists()
-            && !target.join(PAGE).is_file()
-            && std::fs::read_dir(&target).map_or(true, |mut entries| entries.next().is_some());
-        if taken {
-            return Err(Failure::input(
-                format!("`{}` holds something else", target.display()),
-                "name another folder with `-o`",
-            ));
+        match earlier(&target) {
+            Some(_) => Ok(target),
+            None => Err(Failure::input(occupied(&target), ANOTHER)),
         }
-        Ok(target)
     }
 
     /// The experiment with the video, the model and the other flags.
@@ -186,7 +182,7 @@ impl Reconstruct {
     /// What was made, what was assumed, and where the time went.
     fn report(terminal: &Terminal, outcome: &Outcome, target: &Path) -> Result<(), Failure> {
         let manifest: Manifest =
-            files::read_json(&target.join("manifest.json")).map_err(|e| tell(terminal, &e))?;
+            files::read_json(&target.join(MANIFEST)).map_err(|e| tell(terminal, &e))?;
         let mut text = String::from("\n");
         for [label, value] in &manifest.assumptions {
             let _ = writeln!(text, "{label:<12}{value}");
@@ -264,10 +260,37 @@ fn artifact(runs: &Path, outcome: &Outcome) -> Result<PathBuf, RunError> {
     Ok(cache_of(runs).path(&work.key).join(FOLDER))
 }
 
-/// Copies the result to where it was asked for; what an earlier result left there goes.
+/// The files of the earlier result in `target`, which may go; `None` where it holds anything else.
+fn earlier(target: &Path) -> Option<Vec<PathBuf>> {
+    if !target.exists() {
+        return Some(Vec::new());
+    }
+    if std::fs::read_dir(target).ok()?.next().is_none() {
+        return Some(Vec::new());
+    }
+    let manifest: Manifest = files::read_json(&target.join(MANIFEST)).ok()?;
+    let own = |file: &PathBuf| {
+        file == Path::new(MANIFEST) || manifest.files.iter().any(|name| file == Path::new(name))
+    };
+    let found = files::files_below(target).ok()?;
+    found.iter().all(own).then_some(found)
+}
+
+const ANOTHER: &str = "name another folder with `-o`";
+
+fn occupied(target: &Path) -> String {
+    format!("`{}` holds something else", target.display())
+}
+
+/// Copies the result to where it was asked for; the files of an earlier result there go.
 fn publish(artifact: &Path, target: &Path) -> Result<(), RunError> {
-    if target.exists() {
-        files::remove(target)?;
+    // Asked again: a reconstruction takes long enough for somebody to have put something there.
+    let old = earlier(target).ok_or_else(|| RunError::Request {
+        message: occupied(target),
+        help: ANOTHER.into(),
+    })?;
+    for file in old {
+        files::remove(&target.join(file))?;
     }
     files::copy_tree(artifact, target)
 }

@@ -6,6 +6,7 @@ use crate::experiment::docs::{self, Setting};
 use crate::experiment::load::beside;
 use crate::experiment::registry::{Registry, noun};
 use crate::run::RunDirectory;
+use crate::run::report::TABLE;
 use serde_json::json;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
@@ -100,7 +101,12 @@ impl super::Run for Show {
                 "place": entry.place, "text": source, "settings": settings,
             }));
         }
-        if !found && let Ok(run) = RunDirectory::named(&self.runs, &self.name) {
+        let fitting = if found {
+            Vec::new()
+        } else {
+            RunDirectory::fitting(&self.runs, &self.name).map_err(Failure::machine)?
+        };
+        if !found && let [run] = fitting.as_slice() {
             found = true;
             let record = run.read().map_err(Failure::machine)?;
             let _ = writeln!(text, "run {}\n  state       {}", run.name(), record.state);
@@ -122,10 +128,17 @@ impl super::Run for Show {
                     let _ = writeln!(text, "    {}{stage}: {}", error.code, error.message);
                 }
             }
-            if let Ok(table) = std::fs::read_to_string(run.report().join("table.md")) {
+            if let Ok(table) = std::fs::read_to_string(run.report().with_file_name(TABLE)) {
                 let _ = writeln!(text, "\n{table}");
             }
             values.push(serde_json::to_value(&record).map_err(Failure::machine)?);
+        }
+        if !found && fitting.len() > 1 {
+            let names: Vec<String> = fitting.iter().map(RunDirectory::name).collect();
+            return Err(Failure::input(
+                format!("{} runs fit `{}`", names.len(), self.name),
+                format!("they are {}", names.join(", ")),
+            ));
         }
         if !found {
             let all = registry.list(None);

@@ -4,7 +4,7 @@
 //! budgets, E06 inputs missing or changed, W07 smells. Rendering follows rustc; meaning is never carried by colour alone.
 
 use super::problem::Code;
-use super::source::{Origin, Sources};
+use super::source::Sources;
 use annotate_snippets::{AnnotationKind, Level, Renderer, Snippet, renderer::DecorStyle};
 use serde::Serialize;
 
@@ -231,19 +231,6 @@ impl Report {
                 }
             })
             .collect()
-    }
-
-    /// Says of a mistake in another file how that file takes part.
-    pub fn name_layers(&mut self) {
-        for diagnostic in &mut self.diagnostics {
-            if let Some(source) = self.sources.get(diagnostic.span.layer)
-                && let Origin::Extended(by) = &source.origin
-            {
-                diagnostic
-                    .notes
-                    .push(format!("a layer of {by}, which is over it"));
-            }
-        }
     }
 
     /// Drops repetitions (every arm and seed finds the same mistakes) and orders by place.

@@ -1,6 +1,6 @@
 //! The typed graph that an experiment becomes: stages with complete settings, edges, and what identifies them.
 
-use super::artifact::{ArtifactKind, Description};
+use super::artifact::Description;
 use super::source::Sources;
 use super::stage::{AnyOp, DataInput, FileInput, InputFacts, Inputs, StagePlan};
 use super::typed::Trace;
@@ -45,7 +45,7 @@ pub struct Cell {
 }
 
 impl Cell {
-    /// A name for people and file names: `full-s0`, or the experiment's own name where there is only one cell.
+    /// A name for people and file names: `full-s0`, or `s0` where there is neither arm nor grid.
     pub fn label(&self) -> String {
         if self.arm.is_empty() {
             format!("s{}", self.seed)
@@ -193,21 +193,6 @@ impl Graph {
             keys.push(ArtifactKey(hasher.finalize()));
         }
         Ok(keys)
-    }
-
-    /// The artifact kind of each stage that nothing else reads: what the experiment is for.
-    pub fn results(&self) -> Vec<(&str, ArtifactKind)> {
-        let read: Vec<usize> = self
-            .stages
-            .iter()
-            .flat_map(|stage| stage.edges.iter().flat_map(|edge| edge.from.clone()))
-            .collect();
-        self.stages
-            .iter()
-            .enumerate()
-            .filter(|(index, _)| !read.contains(index))
-            .map(|(_, stage)| (stage.name.as_str(), stage.op.output()))
-            .collect()
     }
 }
 

@@ -71,7 +71,7 @@ impl Pass<'_> {
             place
         };
         self.steps += 1;
-        if self.steps > MAX_STEPS {
+        if self.steps > MAX_STEPS || self.weight > MAX_WEIGHT {
             return fail(place);
         }
         if self.steps == MAX_STEPS {
@@ -84,19 +84,9 @@ impl Pass<'_> {
             .and_then(|rest| rest.strip_suffix('}'))
             && !name.contains('}')
         {
-            let mut node = match self.look_up(name, &place) {
-                Some(node) => self.inside(name, node),
-                None => fail(place.clone()),
-            };
-            self.weight += node.weight();
-            if self.weight > MAX_WEIGHT {
-                self.report(
-                    &place,
-                    "substitution makes too many values",
-                    "check `params`",
-                );
+            let Some(mut node) = self.look_up(name, &place) else {
                 return fail(place);
-            }
+            };
             let source = Node::new(node.data.clone(), node.span);
             node.before = if node.span == place.span {
                 before
@@ -128,7 +118,6 @@ impl Pass<'_> {
             let Some(node) = self.look_up(name, &place) else {
                 return fail(place);
             };
-            let node = self.inside(name, node);
             if matches!(node.data, Data::List(_) | Data::Map(_) | Data::Null) {
                 let message = format!(
                     "`${{{name}}}` is {} and cannot be part of a text",
@@ -155,15 +144,28 @@ impl Pass<'_> {
         node
     }
 
-    /// Substitutes inside what a name stands for.
-    fn inside(&mut self, name: &str, node: Node) -> Node {
+    /// What a name stands for, substituted inside; `None` after a report.
+    fn look_up(&mut self, name: &str, place: &Node) -> Option<Node> {
+        let node = self.named(name, place)?;
         self.inside.push(name.to_owned());
         let node = self.node(node);
         self.inside.pop();
-        node
+        let reported = self.weight > MAX_WEIGHT;
+        self.weight += node.weight();
+        if self.weight > MAX_WEIGHT {
+            if !reported {
+                self.report(
+                    place,
+                    "substitution makes too many values",
+                    "check `params`",
+                );
+            }
+            return None;
+        }
+        Some(node)
     }
 
-    fn look_up(&mut self, name: &str, place: &Node) -> Option<Node> {
+    fn named(&mut self, name: &str, place: &Node) -> Option<Node> {
         if self.inside.iter().any(|other| other == name) || self.inside.len() > 32 {
             let circle = format!("`${{{name}}}` stands for itself");
             self.report(place, &circle, "break the circle");
@@ -209,5 +211,32 @@ impl Pass<'_> {
     fn report(&mut self, place: &Node, message: &str, help: &str) {
         self.diagnostics
             .push(Diagnostic::new(Code::E0105, place.span, message).help(help));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_makes_too_much_is_said_once_and_ends_there() {
+        let list = vec!["1"; 500].join(", ");
+        for use_of in ["${params.big}", "x ${params.big}"] {
+            let text = format!("params: {{big: [{list}]}}\n");
+            let uses: String = (0..2000).map(|n| format!("k{n}: {use_of}\n")).collect();
+            let text = text + &uses;
+            let mut diagnostics = Vec::new();
+            let root = yaml::parse(&text, 0, &mut diagnostics).unwrap();
+            assert!(diagnostics.is_empty());
+            let params = root.get("params").unwrap().clone();
+            let whole = interpolate(root, &params, &BTreeMap::new(), &mut diagnostics);
+            let said = |words: &str| {
+                let fits = |d: &&Diagnostic| d.message.contains(words);
+                diagnostics.iter().filter(fits).count()
+            };
+            assert_eq!(said("too many values"), 1);
+            assert!(diagnostics.len() < 500, "{}", diagnostics.len());
+            assert_eq!(whole.get("k1999").and_then(Node::text), Some("???"));
+        }
     }
 }

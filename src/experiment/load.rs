@@ -86,12 +86,25 @@ pub fn check(catalog: &Catalog, request: &Request) -> (Option<Experiment>, Repor
         text: text.clone(),
         origin: Origin::File,
     });
-    let mut registry = Registry::new(catalog, None);
+    let mut registry = Registry::new(catalog, registry_of(&request.path).as_deref());
     registry.put(kind.kind, name, layer, &text, &request.path);
     let span = Span::point(layer, 0);
     entry_settings(catalog, &mut registry, kind, name, span, &mut report);
     report.tidy();
     (None, report)
+}
+
+/// The folder `registry` that an entry's file is in, or the one beside it.
+fn registry_of(entry: &Path) -> Option<PathBuf> {
+    let above = |path: &Path| {
+        let mut folders = path.ancestors().skip(1);
+        let found =
+            folders.find(|folder| folder.file_name().is_some_and(|name| name == "registry"));
+        found.map(Path::to_owned)
+    };
+    above(entry)
+        .or_else(|| beside(entry, "registry"))
+        .or_else(|| above(&canonical(entry)))
 }
 
 /// The settings of a registry entry, complete, as an experiment in `path` sees it; `None` where it has mistakes.
@@ -164,17 +177,15 @@ fn build(
     }
     let folder = beside(&request.path, "registry");
     let mut registry = Registry::new(catalog, folder.as_deref());
-    for (entry, message) in &registry.problems {
+    for (entry, message, help) in &registry.problems {
         let layer = sources.add(Source {
             name: entry.place.clone(),
             path: None,
             text: entry.text.to_string(),
             origin: Origin::Registry,
         });
-        diagnostics.push(
-            Diagnostic::new(Code::E0205, Span::point(layer, 0), message.clone())
-                .help("give it another name"),
-        );
+        diagnostics
+            .push(Diagnostic::new(Code::E0205, Span::point(layer, 0), message.clone()).help(*help));
     }
     for clash in catalog.clashes() {
         diagnostics.push(Diagnostic::new(Code::E0205, plan.name_span, clash));
@@ -217,7 +228,7 @@ fn build(
     columns.dedup();
     let compare = plan
         .compare
-        .and_then(|node| resolver.compare(&node, &plan.arms, &columns));
+        .and_then(|node| resolver.compare(&node, &plan.rows, &columns));
     Some(Experiment {
         name: plan.name,
         about: plan.about,

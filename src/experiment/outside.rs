@@ -28,7 +28,7 @@ pub fn missing_file(file: &FileInput, span: Span) -> Option<Diagnostic> {
     Some(
         Diagnostic::new(Code::E0601, span, message)
             .label("not found")
-            .help("relative paths start at the file they are written in"),
+            .help("relative paths start at the file they are written in, those of `--set` and of registry entries at the current folder"),
     )
 }
 

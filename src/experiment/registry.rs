@@ -22,8 +22,11 @@ pub struct Registry {
     /// By kind and name.
     entries: BTreeMap<(String, String), Slot>,
     /// Files that are no entries, and names given twice.
-    pub problems: Vec<(EntryText, String)>,
+    pub problems: Vec<Problem>,
 }
+
+/// What is wrong with a file of the folder, and the way out.
+type Problem = (EntryText, String, &'static str);
 
 struct Slot {
     text: EntryText,
@@ -51,7 +54,7 @@ impl Registry {
             for (entry, unread) in project(folder) {
                 match unread {
                     None => registry.insert(entry),
-                    Some(reason) => registry.problems.push((entry, reason)),
+                    Some(reason) => registry.problems.push((entry, reason, "")),
                 }
             }
         }
@@ -63,6 +66,7 @@ impl Registry {
             self.problems.push((
                 entry,
                 "a registry entry starts with `KIND: NAME`".to_owned(),
+                "move what is no entry out of `registry/`",
             ));
             return;
         };
@@ -76,7 +80,7 @@ impl Registry {
                 "two {} entries are named `{}`: {} and {}",
                 key.0, key.1, other.text.place, entry.place
             );
-            self.problems.push((entry, message));
+            self.problems.push((entry, message, "give it another name"));
             return;
         }
         self.entries.insert(

@@ -79,17 +79,8 @@ impl Resolver<'_> {
     pub fn graph(&mut self, root: &Node, seed: u64) -> Option<Graph> {
         let before = self.errors();
         sweep::keys(root, &KEYS, self.diagnostics);
-        if let Some(name) = root.get("experiment")
-            && !super::load::scalar(name).is_some_and(|name| sweep::is_name(&name))
-        {
-            self.diagnostics.push(
-                Diagnostic::new(
-                    Code::E0202,
-                    name.span,
-                    format!("`{}` cannot name an experiment", name.inline()),
-                )
-                .help("use letters, digits, `_` and `-`: it becomes part of folder names"),
-            );
+        if let Some(name) = root.get("experiment") {
+            sweep::check_name(name, "an experiment", self.diagnostics);
         }
         let empty = Node::new(Data::Map(Vec::new()), root.span);
         let params = root.get("params").unwrap_or(&empty).clone();

@@ -12,12 +12,12 @@ pub enum Origin {
     /// A file that another one extends, or the base of a sweep: the name of the one that asked.
     Extended(String),
     /// An experiment whose stage another one reads.
-    Imported(String),
+    Imported,
     /// A registry entry: built in, the project's, or linked in.
     Registry,
     /// A `--set` argument.
     Set,
-    /// A variable of the environment.
+    /// `data.yaml`: where data sets lie on this machine.
     Environment,
 }
 

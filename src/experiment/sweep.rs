@@ -11,6 +11,8 @@ use super::yaml::{Data, Item, Node};
 
 /// More runs than anybody waits for.
 const MAX_CELLS: usize = 4096;
+/// Values of all cells together (see [`Node::weight`]): some hundred megabytes.
+const MAX_WEIGHT: usize = 2_000_000;
 /// The keys of a sweep.
 pub const KEYS: [&str; 9] = [
     "sweep", "base", "about", "seeds", "arms", "grid", "compare", "stages", "params",
@@ -23,7 +25,8 @@ pub struct Plan {
     pub about: String,
     pub cells: Vec<Draft>,
     pub compare: Option<Node>,
-    pub arms: Vec<String>,
+    /// What the cells are called, seeds apart: the rows of a comparison.
+    pub rows: Vec<String>,
 }
 
 /// One cell: a whole experiment as nodes.
@@ -74,7 +77,7 @@ pub fn single(composer: &mut Composer<'_>, root: Node, patches: Vec<Node>) -> Pl
             root,
         }],
         compare: None,
-        arms: Vec::new(),
+        rows: Vec::new(),
     }
 }
 
@@ -96,6 +99,7 @@ pub fn open(composer: &mut Composer<'_>, root: Node, patches: Vec<Node>) -> Opti
     }
     keys(&root, &KEYS, composer.diagnostics);
     let name = root.get("sweep")?;
+    check_name(name, "a sweep", composer.diagnostics);
     let base = match root.get("base") {
         None => {
             composer.diagnostics.push(
@@ -143,7 +147,7 @@ pub fn open(composer: &mut Composer<'_>, root: Node, patches: Vec<Node>) -> Opti
         merge::merge(base, own, composer.diagnostics)
     };
     let arms = arms_of(&root, composer.diagnostics);
-    let points = grid_of(&root, composer.diagnostics);
+    let points = grid_of(&root, composer.diagnostics)?;
     let seeds = seeds_of(&root, &base, composer.diagnostics);
     if arms.len() * points.len() * seeds.len() > MAX_CELLS {
         composer.diagnostics.push(
@@ -161,7 +165,21 @@ pub fn open(composer: &mut Composer<'_>, root: Node, patches: Vec<Node>) -> Opti
         );
         return None;
     }
+    let heaviest = |patches: &[(String, Option<Node>)]| {
+        let weights = patches.iter().flat_map(|(_, patch)| patch);
+        weights.map(Node::weight).max().unwrap_or(0)
+    };
+    let weight = base.weight()
+        + heaviest(&arms)
+        + heaviest(&points)
+        + last.iter().map(Node::weight).sum::<usize>();
+    let cells = arms.len() * points.len() * seeds.len();
+    if cells.saturating_mul(weight) > MAX_WEIGHT {
+        composer.diagnostics.push(too_heavy(name, cells, weight));
+        return None;
+    }
     let mut cells = Vec::new();
+    let mut rows = Vec::new();
     for (arm, patch) in &arms {
         for (point, grid) in &points {
             let mut cell = base.clone();
@@ -173,11 +191,8 @@ pub fn open(composer: &mut Composer<'_>, root: Node, patches: Vec<Node>) -> Opti
                 let patch = merge::expand(patch, composer.diagnostics);
                 cell = merge::merge(cell, patch, composer.diagnostics);
             }
-            let arm = match (arm.is_empty(), point.is_empty()) {
-                (_, true) => arm.clone(),
-                (true, false) => point.clone(),
-                (false, false) => format!("{arm}-{point}"),
-            };
+            let arm = row(arm, point);
+            rows.push(arm.clone());
             for &seed in &seeds {
                 cells.push(Draft {
                     arm: arm.clone(),
@@ -192,9 +207,27 @@ pub fn open(composer: &mut Composer<'_>, root: Node, patches: Vec<Node>) -> Opti
         name_span: name.span,
         about: about_of(&root),
         compare: root.get("compare").cloned(),
-        arms: arms.into_iter().map(|(name, _)| name).collect(),
+        rows,
         cells,
     })
+}
+
+/// What the cells of an arm and a grid point are called.
+fn row(arm: &str, point: &str) -> String {
+    match (arm.is_empty(), point.is_empty()) {
+        (_, true) => arm.to_owned(),
+        (true, false) => point.to_owned(),
+        (false, false) => format!("{arm}-{point}"),
+    }
+}
+
+fn too_heavy(place: &Node, cells: usize, weight: usize) -> Diagnostic {
+    Diagnostic::new(
+        Code::E0501,
+        place.span,
+        format!("{cells} runs of {weight} values each are more than {MAX_WEIGHT} values"),
+    )
+    .help("make the grid smaller, or move long lists into a file that an op reads")
 }
 
 /// Reports keys that a document does not have.
@@ -225,6 +258,20 @@ pub fn is_name(name: &str) -> bool {
             .chars()
             .all(|c| c.is_alphanumeric() || matches!(c, '_' | '-' | '.' | '@' | '='))
         && !name.starts_with('.')
+}
+
+/// Reports a name of an experiment or a sweep (`what`) that cannot be part of file names.
+pub fn check_name(name: &Node, what: &str, diagnostics: &mut Vec<Diagnostic>) {
+    if !scalar(name).is_some_and(|name| is_name(&name)) {
+        diagnostics.push(
+            Diagnostic::new(
+                Code::E0202,
+                name.span,
+                format!("`{}` cannot name {what}", name.inline()),
+            )
+            .help("use letters, digits, `_` and `-`: it becomes part of folder names"),
+        );
+    }
 }
 
 fn about_of(root: &Node) -> String {
@@ -334,11 +381,11 @@ fn arms_of(root: &Node, diagnostics: &mut Vec<Diagnostic>) -> Vec<(String, Optio
     arms
 }
 
-/// Every point of the grid as a name and a patch; one empty point where there is no grid.
-fn grid_of(root: &Node, diagnostics: &mut Vec<Diagnostic>) -> Vec<(String, Option<Node>)> {
+/// Every point of the grid as a name and a patch; one empty point where there is no grid, `None` where it is too much.
+fn grid_of(root: &Node, diagnostics: &mut Vec<Diagnostic>) -> Option<Vec<(String, Option<Node>)>> {
     let mut points: Vec<(String, Option<Node>)> = vec![(String::new(), None)];
     let Some(grid) = root.get("grid") else {
-        return points;
+        return Some(points);
     };
     if !matches!(grid.data, Data::Map(_)) {
         diagnostics.push(
@@ -349,9 +396,9 @@ fn grid_of(root: &Node, diagnostics: &mut Vec<Diagnostic>) -> Vec<(String, Optio
             )
             .help("`grid: {stages.mget.steps: [100, 200]}`"),
         );
-        return points;
+        return Some(points);
     }
-    for item in grid.items() {
+    for (number, item) in grid.items().iter().enumerate() {
         if item.value.list().is_empty() {
             diagnostics.push(
                 Diagnostic::new(
@@ -364,7 +411,21 @@ fn grid_of(root: &Node, diagnostics: &mut Vec<Diagnostic>) -> Vec<(String, Optio
             continue;
         }
         let short = item.key.rsplit('.').next().unwrap_or(&item.key);
+        let short = if is_name(short) {
+            short.to_owned()
+        } else {
+            format!("key{}", number + 1)
+        };
         let mut next = Vec::new();
+        let many = (points.len() * item.value.list().len()).min(MAX_CELLS + 1);
+        let patches = points.iter().flat_map(|(_, patch)| patch);
+        let values = item.value.list().iter();
+        let weight = patches.map(Node::weight).max().unwrap_or(1)
+            + values.map(Node::weight).max().unwrap_or(0);
+        if many.saturating_mul(weight) > MAX_WEIGHT {
+            diagnostics.push(too_heavy(&item.value, many, weight));
+            return None;
+        }
         for (name, patch) in &points {
             for (index, value) in item.value.list().iter().enumerate() {
                 if next.len() > MAX_CELLS {
@@ -405,5 +466,5 @@ fn grid_of(root: &Node, diagnostics: &mut Vec<Diagnostic>) -> Vec<(String, Optio
         }
         points = next;
     }
-    points
+    Some(points)
 }

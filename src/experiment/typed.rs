@@ -25,6 +25,17 @@ pub struct Trace {
     pub before: Vec<(Span, String)>,
 }
 
+impl Trace {
+    /// Where a node was written, and what it replaced.
+    pub fn of(node: &Node) -> Self {
+        let earlier = std::iter::successors(node.before.as_deref(), |node| node.before.as_deref());
+        Self {
+            span: node.span,
+            before: earlier.map(|node| (node.span, node.inline())).collect(),
+        }
+    }
+}
+
 /// Turns nodes into settings.
 pub struct Typer<'c, 'm> {
     pub catalog: &'c Catalog,
@@ -114,19 +125,7 @@ impl<'c> Typer<'c, '_> {
     }
 
     fn trace(&mut self, node: &Node, path: &str) {
-        let mut before = Vec::new();
-        let mut earlier = node.before.as_deref();
-        while let Some(node) = earlier {
-            before.push((node.span, node.inline()));
-            earlier = node.before.as_deref();
-        }
-        self.traces.insert(
-            path.to_owned(),
-            Trace {
-                span: node.span,
-                before,
-            },
-        );
+        self.traces.insert(path.to_owned(), Trace::of(node));
     }
 
     fn report(&mut self, diagnostic: Diagnostic) {

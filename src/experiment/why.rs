@@ -1,12 +1,13 @@
 //! Which layer set a value, and what it replaced.
 
 use super::catalog::Catalog;
+use super::diagnostic::Span;
 use super::docs;
 use super::graph::{Cell, Experiment, Head, Stage};
 use super::names;
 use super::source::Origin;
 use super::typed::Trace;
-use super::yaml::{Data, Node};
+use super::yaml::{self, Data, Node};
 use serde::Serialize;
 use serde_json::Value;
 use std::fmt::Write as _;
@@ -127,7 +128,7 @@ fn answer(
             chain.push(Link {
                 value,
                 place: experiment.sources.cite(span),
-                layer: layer(experiment, cell, span.layer),
+                layer: layer(experiment, cell, span),
             });
         }
     } else {
@@ -150,20 +151,34 @@ fn answer(
     }
 }
 
-fn layer(experiment: &Experiment, cell: &Cell, layer: u32) -> String {
-    let Some(source) = experiment.sources.get(layer) else {
+fn layer(experiment: &Experiment, cell: &Cell, span: Span) -> String {
+    let Some(source) = experiment.sources.get(span.layer) else {
         return String::new();
     };
     match &source.origin {
+        Origin::File if experiment.sweep && of_all_arms(&source.text, span) => {
+            "the sweep".to_owned()
+        }
         Origin::File if experiment.sweep && !cell.arm.is_empty() => format!("arm `{}`", cell.arm),
         Origin::File => "the file".to_owned(),
         Origin::Extended(_) if experiment.sweep => "the base".to_owned(),
         Origin::Extended(by) => format!("extended by {by}"),
-        Origin::Imported(_) => "another experiment".to_owned(),
+        Origin::Imported => "another experiment".to_owned(),
         Origin::Registry => "the registry".to_owned(),
         Origin::Set => "the command line".to_owned(),
         Origin::Environment => "the environment".to_owned(),
     }
+}
+
+/// Whether a place in a sweep's file is in the blocks that change every arm.
+fn of_all_arms(text: &str, span: Span) -> bool {
+    let Some(root) = yaml::parse(text, span.layer, &mut Vec::new()) else {
+        return false;
+    };
+    let mut blocks = ["stages", "params"]
+        .into_iter()
+        .filter_map(|key| root.get(key));
+    blocks.any(|block| block.span.start <= span.start && span.end <= block.span.end)
 }
 
 /// Every setting and edge of a stage as text.
@@ -216,14 +231,10 @@ pub(super) fn heads(root: &Node) -> Vec<Head> {
             }
             return;
         }
-        let earlier = std::iter::successors(node.before.as_deref(), |node| node.before.as_deref());
         into.push(Head {
             key,
             value: node.inline(),
-            trace: Trace {
-                span: node.span,
-                before: earlier.map(|node| (node.span, node.inline())).collect(),
-            },
+            trace: Trace::of(node),
         });
     }
     let mut heads = Vec::new();
@@ -245,7 +256,7 @@ fn head(experiment: &Experiment, cell: &Cell, key: &str) -> Vec<Answer> {
             .map(|(span, value)| Link {
                 value,
                 place: experiment.sources.cite(span),
-                layer: layer(experiment, cell, span.layer),
+                layer: layer(experiment, cell, span),
             })
             .collect()
     };

@@ -131,17 +131,19 @@ impl Node {
         }
     }
 
-    /// How much it takes: one for each value, one for each sixteen bytes of text.
+    /// How much it takes, with what it replaced: one for each value, one for each sixteen bytes of text.
     pub fn weight(&self) -> usize {
-        1 + match &self.data {
-            Data::Text(text) => text.len() / 16,
-            Data::List(nodes) => nodes.iter().map(Node::weight).sum(),
-            Data::Map(items) => items
-                .iter()
-                .map(|item| 1 + item.key.len() / 16 + item.value.weight())
-                .sum(),
-            _ => 0,
-        }
+        let earlier = self.before.as_deref().map_or(0, Node::weight);
+        1 + earlier
+            + match &self.data {
+                Data::Text(text) => text.len() / 16,
+                Data::List(nodes) => nodes.iter().map(Node::weight).sum(),
+                Data::Map(items) => items
+                    .iter()
+                    .map(|item| 1 + item.key.len() / 16 + item.value.weight())
+                    .sum(),
+                _ => 0,
+            }
     }
 
     /// The value as JSON, spans dropped.

@@ -9,7 +9,7 @@ use super::environment;
 use super::error::{AtPath, RunError};
 use super::files;
 use super::interrupt::Interrupt;
-use super::lock::{self, Lock};
+use super::lock::Lock;
 use crate::experiment::ArtifactKey;
 
 use serde::{Deserialize, Serialize};
@@ -331,11 +331,6 @@ impl Cache {
             }
         }
         Ok(leaves)
-    }
-
-    /// Whether a process is making `key` now.
-    pub fn is_being_made(&self, key: &Key) -> bool {
-        lock::is_held(&self.lock_path(key))
     }
 
     /// A `Made` for work that ends now.

@@ -23,10 +23,20 @@ pub enum Mode {
     Shared,
 }
 
+/// How often a lock is tried before it counts as held.
+const LOOKS: usize = 6;
+
 impl Lock {
     /// Takes the lock, or says who has it.
     pub fn take(path: &Path, mode: Mode) -> Result<Self, RunError> {
-        Self::attempt(path, mode)?.ok_or_else(|| RunError::Held {
+        for _ in 0..LOOKS {
+            if let Some(lock) = Self::attempt(path, mode)? {
+                return Ok(lock);
+            }
+            // Somebody who only looks (`is_held`) has it for a moment.
+            std::thread::sleep(Duration::from_millis(20));
+        }
+        Err(RunError::Held {
             path: path.to_path_buf(),
             holder: holder(path),
         })
@@ -167,6 +177,19 @@ mod tests {
         let _first = Lock::take(&path, Mode::Shared).unwrap();
         let _second = Lock::take(&path, Mode::Shared).unwrap();
         assert!(Lock::attempt(&path, Mode::Exclusive).unwrap().is_none());
+    }
+
+    #[test]
+    fn a_look_does_not_make_a_start_fail() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("lock");
+        let look = Lock::take(&path, Mode::Shared).unwrap();
+        let looker = std::thread::spawn(move || {
+            std::thread::sleep(Duration::from_millis(30));
+            drop(look);
+        });
+        Lock::take(&path, Mode::Exclusive).unwrap();
+        looker.join().unwrap();
     }
 
     #[test]

@@ -57,14 +57,14 @@ impl Metrics {
         self.last_step
     }
 
-    /// Records scalars of a step. A step at or before the last one drops that step and all after it first.
+    /// Records scalars of a step. A step before the last one (for the first record of a resumed stage: also the last one)
+    /// drops that step and all after it first.
     pub fn scalars(&mut self, step: u64, scalars: &[(&str, f64)]) -> Result<(), RunError> {
         let time = environment::now();
         self.line.clear();
         let _ = write!(self.line, "{{\"step\":{step},\"time\":{time:.3}");
         for (name, value) in scalars {
-            self.line.push(',');
-            push_json_string(&mut self.line, name);
+            let _ = write!(self.line, ",{}", Value::from(*name));
             if value.is_finite() {
                 let _ = write!(self.line, ":{value:?}");
             } else {
@@ -200,20 +200,6 @@ impl Metrics {
             flushed: Stopwatch::start(),
         })
     }
-}
-
-fn push_json_string(line: &mut String, text: &str) {
-    line.push('"');
-    for c in text.chars() {
-        match c {
-            '"' | '\\' => line.extend(['\\', c]),
-            c if (c as u32) < 0x20 => {
-                let _ = write!(line, "\\u{:04x}", c as u32);
-            }
-            c => line.push(c),
-        }
-    }
-    line.push('"');
 }
 
 /// The step of a line, if the line is whole.

@@ -105,10 +105,7 @@ fn resolved(job: &Job<'_>) -> String {
         for stage in &cell.graph.stages {
             let name = scalar(&Value::String(stage.name.clone()));
             let written = write_stage(job, stage, &cell.graph.stages);
-            if seen.insert(format!(
-                "{name}{}{written}",
-                if stage.op.seeded() { cell.seed } else { 0 }
-            )) {
+            if seen.insert(format!("{name}{written}")) {
                 let _ = write!(text, "  {name}:\n{written}");
             } else {
                 let _ = writeln!(text, "  {name}: {{}} # as above");
@@ -138,6 +135,10 @@ fn write_stage(job: &Job<'_>, stage: &Stage, all: &[Stage]) -> String {
         for (key, value) in settings {
             write_value(&mut text, job, stage, key, key, value, 4);
         }
+    }
+    if stage.op.seeded() {
+        let from = origin(job, stage, "seed");
+        let _ = writeln!(text, "    seed: {}{from}", stage.seed);
     }
     text
 }

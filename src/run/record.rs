@@ -138,16 +138,9 @@ impl RunDirectory {
 
     /// A run by its path, its name below `runs`, or the beginning or end of that name where only one fits.
     pub fn named(runs: &Path, name: &str) -> Result<Self, RunError> {
-        for path in [PathBuf::from(name), runs.join(name)] {
-            if path.join("run.json").is_file() {
-                return Ok(Self { path });
-            }
-        }
-        let all = Self::all(runs)?;
-        let fits = |run: &&Self| run.name().starts_with(name) || run.name().ends_with(name);
-        let found: Vec<&Self> = all.iter().filter(fits).collect();
+        let found = Self::fitting(runs, name)?;
         match found.as_slice() {
-            [only] if !name.is_empty() => Ok((*only).clone()),
+            [only] => Ok(only.clone()),
             _ => Err(RunError::Request {
                 message: match found.len() {
                     0 => format!("no run `{name}` in `{}`", runs.display()),
@@ -158,7 +151,22 @@ impl RunDirectory {
         }
     }
 
-    /// Every run below `runs`, sorted by name. A directory whose record cannot be read is left out.
+    /// The runs that [`RunDirectory::named`] chooses from.
+    pub fn fitting(runs: &Path, name: &str) -> Result<Vec<Self>, RunError> {
+        if name.is_empty() {
+            return Ok(Vec::new());
+        }
+        for path in [PathBuf::from(name), runs.join(name)] {
+            if path.join("run.json").is_file() {
+                return Ok(vec![Self { path }]);
+            }
+        }
+        let mut all = Self::all(runs)?;
+        all.retain(|run| run.name().starts_with(name) || run.name().ends_with(name));
+        Ok(all)
+    }
+
+    /// Every run below `runs`, sorted by name: each directory with a `run.json`, whether it can be read or not.
     pub fn all(runs: &Path) -> Result<Vec<Self>, RunError> {
         let entries = match std::fs::read_dir(runs) {
             Ok(entries) => entries,
@@ -275,7 +283,9 @@ impl RunDirectory {
 
     /// Whether any process works on it now.
     pub fn is_busy(&self) -> bool {
-        lock::is_held(&self.path.join(".lock"))
+        // Shards share the lock of the whole, which a look does not see: each holds its own.
+        let running = |run: Run| run.parts.values().any(|part| part.state == State::Running);
+        lock::is_held(&self.path.join(".lock")) || self.read().is_ok_and(running)
     }
 
     /// Makes this process the owner of a shard, or says who is.

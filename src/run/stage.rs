@@ -144,7 +144,8 @@ pub fn make(
         }
     }
     if result.is_err() {
-        around.cache.abandon(&work.key)?;
+        // The first error is the cause and must be recorded; what stays here goes when the work is begun again.
+        let _ = around.cache.abandon(&work.key);
     }
     match (result, record.write(directory)) {
         (Ok(_), written) => written.map(|()| record),

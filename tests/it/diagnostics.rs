@@ -386,7 +386,7 @@ fn missing_files_and_data_sets_are_found_before_any_compute() {
     5 |   clips: {op: clips, only: nowhere/list.txt, source: recorded}
       |                            ^^^^^^^^^^^^^^^^ not found
       |
-      = help: relative paths start at the file they are written in
+      = help: relative paths start at the file they are written in, those of `--set` and of registry entries at the current folder
 
     error[E0601]: data set `adt`: nothing says where it lies
      --> registry/source/recorded.yaml (built in):3:7

@@ -24,6 +24,7 @@ mod shared;
 mod shipped;
 mod statistics;
 mod sweep_compare;
+mod sweeps;
 mod tiny_movie;
 mod train_mget;
 mod training;

@@ -118,7 +118,7 @@ fn a_linked_entry_of_a_taken_name_is_refused_with_both_places() {
     ];
     let catalog = Catalog::of(&[], &[], places.map(entry).to_vec());
     let registry = Registry::new(&catalog, None);
-    let (_, message) = &registry.problems[0];
+    let (_, message, _) = &registry.problems[0];
     assert!(
         places.iter().all(|place| message.contains(place)),
         "{message}"

@@ -313,4 +313,24 @@ fn a_folder_that_holds_something_else_is_left_alone() {
     std::fs::write(place.path("precious/letter.txt"), b"dear").unwrap();
     place.command("walk", "precious").assert().code(1);
     assert!(place.path("precious/letter.txt").is_file());
+    // A page alone is no earlier result: `reviv view RUN -o view.html` leaves one anywhere.
+    std::fs::write(place.path("precious/view.html"), b"<html>").unwrap();
+    place.command("walk", "precious").assert().code(1);
+    assert_eq!(files(&place.path("precious")).len(), 2);
+}
+
+#[test]
+fn an_earlier_result_is_replaced_only_where_nothing_was_put_beside_it() {
+    let place = Place::new();
+    pictures(&place.path("walk"), 4, [40, 40], false);
+    place.command("walk", "out").assert().success();
+    let made = files(&place.path("out"));
+    std::fs::write(place.path("out/camera.tum"), b"old").unwrap();
+    place.command("walk", "out").assert().success();
+    assert!(files(&place.path("out")) == made, "it was not replaced");
+    let foreign = place.path("out/colmap/notes.txt");
+    std::fs::write(&foreign, b"mine").unwrap();
+    place.command("walk", "out").assert().code(1);
+    assert!(foreign.is_file());
+    assert!(files(&place.path("out")) == made, "something is gone");
 }

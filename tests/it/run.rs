@@ -591,6 +591,32 @@ fn shards_split_a_sweep_without_a_server() {
 }
 
 #[test]
+fn a_run_is_busy_while_a_shard_of_it_is_at_work() {
+    let dir = tempfile::tempdir().unwrap();
+    let asked = experiment(vec![cell("", 0, json!({"steps": 2}), 1.0)]);
+    let directory = run(&asked, dir.path()).run;
+    assert!(!directory.is_busy());
+    let owned = directory.own("1/2".parse().unwrap()).unwrap();
+    owned.begin().unwrap();
+    assert!(directory.is_busy());
+    owned.end(State::Done, None, true).unwrap();
+    drop(owned);
+    assert!(!directory.is_busy());
+}
+
+#[test]
+fn the_seed_of_a_stage_is_in_the_record() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut own = cell("a", 3, json!({"steps": 2}), 1.0);
+    own.graph.stages[0].seed = 9;
+    let cells = vec![own, cell("b", 3, json!({"steps": 2}), 1.0)];
+    let done = run(&experiment(cells), dir.path());
+    let resolved = std::fs::read_to_string(done.run.path().join("resolved.yaml")).unwrap();
+    assert!(resolved.contains("    seed: 9\n"), "{resolved}");
+    assert!(resolved.contains("    seed: 3\n"), "{resolved}");
+}
+
+#[test]
 fn only_one_stage_can_be_asked_for_by_a_name_that_exists() {
     let dir = tempfile::tempdir().unwrap();
     let asked = experiment(vec![cell("", 0, json!({"steps": 25}), 1.0)]);

@@ -10,6 +10,7 @@ const BASE: &str = "
 experiment: scored
 stages:
   scores: {op: evaluate, truth_data: truth, predictions_data: near, suite: {use: world_gaze, metrics: [gaze.mse]}}
+  other_scores: {op: evaluate, truth_data: other, predictions_data: other, suite: {use: world_gaze, metrics: [gaze.l2]}}
 ";
 
 const SWEEP: &str = "
@@ -27,13 +28,13 @@ compare:
   against: adt_gaze
 ";
 
-fn write(folder: &Path, miss: f64) {
+fn write(folder: &Path, name: &str, miss: f64) {
     std::fs::create_dir_all(folder).unwrap();
     for clip in 0..4 {
         let gaze = Array2::from_shape_fn((60, 2), |(t, axis)| {
             0.4 + 0.002 * t as f64 + 0.01 * f64::from(clip) + miss * (axis as f64 + 1.0)
         });
-        let path = folder.join(format!("clip_{clip}.npz"));
+        let path = folder.join(format!("{name}_{clip}.npz"));
         Npz::default().with("gaze", gaze).write(&path).unwrap();
     }
 }
@@ -52,14 +53,20 @@ fn the_arms_of_a_sweep_are_compared_on_its_page() {
     let at = |name: &str| folder.path().join(name);
     std::fs::write(at("base.yaml"), BASE).unwrap();
     std::fs::write(at("sweep.yaml"), SWEEP).unwrap();
-    std::fs::write(at("data.yaml"), "truth: truth\nnear: near\nfar: far\n").unwrap();
+    std::fs::write(
+        at("data.yaml"),
+        "truth: truth\nnear: near\nfar: far\nother: other\n",
+    )
+    .unwrap();
     for (name, miss) in [("truth", 0.0), ("near", 0.01), ("far", 0.1)] {
-        write(&at(name), miss);
+        write(&at(name), "clip", miss);
     }
+    // Scores of other clips, of which the table has no column.
+    write(&at("other"), "another", 0.0);
     let output = run(folder.path());
     let said = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success(), "{said}");
-    assert!(said.contains("2 made"), "{said}");
+    assert!(said.contains("3 made"), "{said}");
     assert!(said.contains("near") && said.contains("far"), "{said}");
     let page = String::from_utf8(output.stdout).unwrap();
     let page = at(page.trim());
@@ -83,6 +90,8 @@ fn the_arms_of_a_sweep_are_compared_on_its_page() {
     let compared = Command::new(env!("CARGO_BIN_EXE_reviv"))
         .args([
             "compare",
+            "--columns",
+            "gaze.mse",
             "--against",
             "adt_gaze",
             "--plot",
@@ -109,13 +118,21 @@ fn the_arms_of_a_sweep_are_compared_on_its_page() {
             .unwrap()
             .contains("ReViV (published)")
     );
+    let shown = Command::new(env!("CARGO_BIN_EXE_reviv"))
+        .arg("show")
+        .arg(&run_name)
+        .current_dir(folder.path())
+        .output()
+        .unwrap();
+    let shown = String::from_utf8_lossy(&shown.stdout).into_owned();
+    assert!(shown.contains("90 % interval"), "{shown}");
     // Asked again: nothing to do, the same page.
     let again = run(folder.path());
     assert!(String::from_utf8_lossy(&again.stderr).contains("done before"));
     assert_eq!(std::fs::read_to_string(&page).unwrap(), text);
     // Another prediction under the same name is another input, and only what reads it is done again.
-    write(&at("far"), 0.2);
+    write(&at("far"), "clip", 0.2);
     let changed = run(folder.path());
     let said = String::from_utf8_lossy(&changed.stderr).into_owned();
-    assert!(said.contains("1 made, 1 found in the cache"), "{said}");
+    assert!(said.contains("1 made, 2 found in the cache"), "{said}");
 }

@@ -11,7 +11,7 @@ use std::collections::BTreeMap;
 
 impl Resolver<'_> {
     /// The `compare:` block of a sweep.
-    pub fn compare(&mut self, node: &Node, arms: &[String], columns: &[String]) -> Option<Compare> {
+    pub fn compare(&mut self, node: &Node, rows: &[String], columns: &[String]) -> Option<Compare> {
         let schema = self.catalog.definition("compare")?;
         let mut typer = Typer {
             catalog: self.catalog,
@@ -36,9 +36,9 @@ impl Resolver<'_> {
                 );
             }
         };
-        let arms: Vec<&str> = arms.iter().map(String::as_str).collect();
+        let rows: Vec<&str> = rows.iter().map(String::as_str).collect();
         if let Some(name) = &compare.baseline {
-            unknown("baseline", "arm", name, &arms);
+            unknown("baseline", "arm", name, &rows);
         }
         // `depth.abs_rel` stands for `depth.abs_rel@depth` and every other space of it.
         let stems = columns.iter().filter_map(|name| name.split_once('@'));

@@ -38,7 +38,9 @@ impl Resolver<'_> {
         let op_span = node.get("op").map_or(node.span, |op| op.span);
         let mut sound = true;
         let mut seed = seed;
+        let mut traces = BTreeMap::new();
         if let Some(own) = node.get("seed") {
+            traces.insert("seed".to_owned(), Trace::of(own));
             match sweep::seed_of(Some(own), self.diagnostics) {
                 Some(own) => seed = own,
                 None => sound = false,
@@ -46,7 +48,6 @@ impl Resolver<'_> {
         }
         let ports = op.inputs();
         let mut edges = Vec::new();
-        let mut traces = BTreeMap::new();
         for port in ports {
             let targets = self.targets(port, item, op, graph, places, &mut traces);
             match targets {

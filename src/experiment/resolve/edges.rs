@@ -49,13 +49,7 @@ impl Resolver<'_> {
             );
             return None;
         };
-        traces.insert(
-            port.name.to_owned(),
-            Trace {
-                span: node.span,
-                before: Vec::new(),
-            },
-        );
+        traces.insert(port.name.to_owned(), Trace::of(node));
         let many = matches!(port.arity, Arity::Many | Arity::Any);
         let nodes: Vec<&Node> = match (&node.data, many) {
             (Data::List(nodes), true) => nodes.iter().collect(),
@@ -111,13 +105,7 @@ impl Resolver<'_> {
                 );
                 continue;
             }
-            traces.insert(
-                format!("{}.{index}", port.name),
-                Trace {
-                    span: node.span,
-                    before: Vec::new(),
-                },
-            );
+            traces.insert(format!("{}.{index}", port.name), Trace::of(node));
             let to = if name.contains('/') {
                 self.import(name, node.span, graph, places)
             } else {

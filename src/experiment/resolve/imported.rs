@@ -42,7 +42,7 @@ impl Resolver<'_> {
             return To::Unknown;
         }
         if !self.imports.contains_key(&identity) {
-            let root = composer.named(&file, asked, Origin::Imported(String::new()));
+            let root = composer.named(&file, asked, Origin::Imported);
             let imported = root.and_then(|root| {
                 if root.get("sweep").is_some() {
                     self.diagnostics.push(
