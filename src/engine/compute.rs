@@ -19,22 +19,21 @@ pub enum DeviceChoice {
     Vulkan,
 }
 
-/// In which numbers matrix products are computed. Norms, softmax, losses, codebooks and weights are always f32.
+/// In which numbers matrix products are computed: f32 for now, on every device. Norms, softmax, losses, codebooks and weights are
+/// always f32.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Precision {
     #[default]
     F32,
-    /// Matrix products in bfloat16 (GPU only).
+    /// bfloat16: not available, no operation computes in it yet.
     Bf16,
 }
 
-/// A device and a precision.
+/// A device that computes in f32.
 #[derive(Debug, Clone)]
 pub struct Compute {
     device: Device,
-    choice: DeviceChoice,
-    precision: Precision,
 }
 
 impl Compute {
@@ -43,15 +42,13 @@ impl Compute {
     pub fn cpu() -> Self {
         Self {
             device: Device::flex(),
-            choice: DeviceChoice::Cpu,
-            precision: Precision::F32,
         }
     }
 
     /// The device `choice` (`index` counts the devices of one kind), computing in `precision`.
     ///
     /// # Errors
-    /// When this build has no such device, or the device no such precision.
+    /// When this build has no such device, or no operation computes in `precision`.
     pub fn new(
         choice: DeviceChoice,
         index: usize,
@@ -62,33 +59,23 @@ impl Compute {
             DeviceChoice::Cuda => cuda(index)?,
             DeviceChoice::Vulkan => vulkan(index)?,
         };
-        if choice == DeviceChoice::Cpu && precision == Precision::Bf16 {
+        if precision == Precision::Bf16 {
             return Err(EngineError::Precision {
                 precision: "bf16",
-                device: "cpu".to_owned(),
+                device: match choice {
+                    DeviceChoice::Cpu => "cpu".to_owned(),
+                    DeviceChoice::Cuda => format!("cuda:{index}"),
+                    DeviceChoice::Vulkan => format!("vulkan:{index}"),
+                },
             });
         }
-        Ok(Self {
-            device,
-            choice,
-            precision,
-        })
+        Ok(Self { device })
     }
 
     /// The tensor library's handle.
     #[must_use]
     pub fn device(&self) -> &Device {
         &self.device
-    }
-
-    #[must_use]
-    pub fn choice(&self) -> DeviceChoice {
-        self.choice
-    }
-
-    #[must_use]
-    pub fn precision(&self) -> Precision {
-        self.precision
     }
 }
 
@@ -106,10 +93,15 @@ fn cuda(index: usize) -> Result<Device, EngineError> {
     })
 }
 
+/// Index 0 is the best GPU there is, which may be an integrated one; others count discrete GPUs.
 #[cfg(feature = "vulkan")]
 #[allow(clippy::unnecessary_wraps)] // the same signature as without the feature
 fn vulkan(index: usize) -> Result<Device, EngineError> {
-    Ok(Device::vulkan(burn::tensor::DeviceKind::DiscreteGpu(index)))
+    use burn::tensor::DeviceKind;
+    Ok(Device::vulkan(match index {
+        0 => DeviceKind::DefaultDevice,
+        index => DeviceKind::DiscreteGpu(index),
+    }))
 }
 
 #[cfg(not(feature = "vulkan"))]
@@ -125,9 +117,21 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_processor_refuses_bf16_by_name() {
-        let error = Compute::new(DeviceChoice::Cpu, 0, Precision::Bf16).unwrap_err();
-        assert!(error.to_string().contains("bf16"), "{error}");
+    fn bf16_is_refused_by_name_with_the_device() {
+        for (choice, device) in [
+            (DeviceChoice::Cpu, "`cpu`"),
+            #[cfg(feature = "cuda")]
+            (DeviceChoice::Cuda, "`cuda:0`"),
+            #[cfg(feature = "vulkan")]
+            (DeviceChoice::Vulkan, "`vulkan:0`"),
+        ] {
+            let error = Compute::new(choice, 0, Precision::Bf16).unwrap_err();
+            let message = error.to_string();
+            assert!(
+                message.contains("`bf16`") && message.contains(device),
+                "{message}"
+            );
+        }
     }
 
     #[cfg(not(feature = "cuda"))]

@@ -7,8 +7,9 @@
 //! * [`mod@parameters`]: how a model holds its numbers, and how they are named, counted, loaded and stored;
 //! * [`weights`]: named arrays on the host and the safetensors files they live in;
 //! * [`initialise`]: where the numbers of a new model come from;
-//! * [`ops`]: linear, layer norm, attention over packed segments, GELU, SwiGLU, cross-entropy, embedding. On the CPU each is one
-//!   fused operation with a hand-written backward; on other back ends it is composed of the library's own operations;
+//! * [`ops`]: linear, layer norm, attention over packed segments, GELU, SwiGLU, cross-entropy, convolution and frame norm of
+//!   video. On the CPU each is one fused operation with a hand-written backward; on other back ends it is composed of the
+//!   library's own operations. Nearest code is a search on the host; embedding is the library's select everywhere;
 //! * [`gradients`]: gradients by parameter name, their global norm.
 
 pub mod compute;
@@ -32,7 +33,9 @@ pub use weights::{HostTensor, Values, Weights};
 pub enum EngineError {
     #[error("device `{device}` is not part of this build ({hint})")]
     NoSuchDevice { device: String, hint: &'static str },
-    #[error("precision `{precision}` is not available on `{device}`; use `f32`")]
+    #[error(
+        "precision `{precision}` is not available on `{device}`: no operation computes in it yet; use `f32`"
+    )]
     Precision {
         precision: &'static str,
         device: String,

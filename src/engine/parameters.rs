@@ -213,6 +213,18 @@ pub trait Parameters {
         weights
     }
 
+    /// Checks that `weights` has every parameter in its shape. A model that is only planned may ask, so that a file whose
+    /// description asks for more than it holds is refused before anything is allocated.
+    ///
+    /// # Errors
+    /// On the first missing or misshapen tensor.
+    fn check_shapes(&self, weights: &Weights) -> Result<(), EngineError> {
+        for (name, shape, _) in self.inventory() {
+            weights.get(&name, &shape)?;
+        }
+        Ok(())
+    }
+
     /// Takes every value from `weights`, which must hold exactly the model's names and shapes, all finite.
     ///
     /// # Errors

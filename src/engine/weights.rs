@@ -199,6 +199,7 @@ impl Weights {
         let header: Map<String, Value> =
             serde_json::from_slice(&header).map_err(|error| format!("header: {error}"))?;
         let start = 8 + header_length;
+        let mut left = length - start;
         let mut weights = Self::default();
         for (name, entry) in header {
             if name == "__metadata__" {
@@ -212,6 +213,10 @@ impl Weights {
                 continue;
             }
             let entry = Entry::parse(&name, &entry, length - start)?;
+            // Tensors may not share bytes: what is allocated stays in proportion to the file.
+            left = left
+                .checked_sub(entry.bytes as u64)
+                .ok_or_else(|| format!("tensor `{name}` overlaps another"))?;
             source
                 .seek(SeekFrom::Start(start + entry.begin))
                 .map_err(io)?;
@@ -241,7 +246,7 @@ impl Weights {
             Some(parent) if !parent.as_os_str().is_empty() => parent,
             _ => Path::new("."),
         };
-        let file = tempfile::NamedTempFile::new_in(folder).map_err(refuse)?;
+        let file = crate::formats::temporary_in(folder).map_err(refuse)?;
         let mut out = std::io::BufWriter::new(file);
         self.write_to(&mut out).map_err(refuse)?;
         let file = out
@@ -510,6 +515,21 @@ mod tests {
                 .unwrap_err()
                 .contains("do not fit")
         );
+    }
+
+    #[test]
+    fn tensors_that_share_bytes_are_refused() {
+        let file = |second: &str| {
+            let header = format!(
+                r#"{{"x":{{"dtype":"U8","shape":[3],"data_offsets":[0,3]}},"y":{{"dtype":"U8","shape":[2],"data_offsets":{second}}}}}"#
+            );
+            let mut bytes = (header.len() as u64).to_le_bytes().to_vec();
+            bytes.extend_from_slice(header.as_bytes());
+            bytes.extend_from_slice(&[1, 2, 3, 4]);
+            Weights::from_bytes(&bytes)
+        };
+        let error = file("[2,4]").unwrap_err();
+        assert!(error.contains("`y` overlaps another"), "{error}");
     }
 
     #[test]

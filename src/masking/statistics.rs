@@ -202,7 +202,7 @@ mod tests {
             Slot::both("rgb", 5120),
         ];
         let found = simulate(&MaskingSettings::default(), &slots, 4000, 1).unwrap();
-        // model.md 5.1: 51% of 4096, 1 to 3% of samples without a target.
+        // Counted from the released code: 51% of 4096, 1 to 3% of samples without a target.
         assert!((found.fill - 0.51).abs() < 0.02, "{found:?}");
         assert!(found.no_target > 0.003 && found.no_target < 0.03);
         assert_eq!(

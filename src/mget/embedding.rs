@@ -1,4 +1,4 @@
-//! How modalities enter and leave the model (model.md 1.4).
+//! How modalities enter and leave the model.
 //!
 //! A visible token is its row of the modality's table (or its tubelet through one linear map) plus its place: a fixed position
 //! code and the modality's learned vector. An asked token is the mask token plus its place. The output matrix of a modality is

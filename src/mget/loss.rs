@@ -1,4 +1,4 @@
-//! Cross-entropy over asked tokens (Eq. 3; model.md 4.3).
+//! Cross-entropy over asked tokens (Eq. 3).
 
 use super::batch::Targets;
 use super::embedding::Heads;

@@ -1,4 +1,4 @@
-//! The Masked Generative Egocentric Transformer (Sec. 4.3, Supp. B; model.md 4.1, 4.2).
+//! The Masked Generative Egocentric Transformer (Sec. 4.3, Supp. B).
 //!
 //! An encoder reads the visible tokens of all modalities; a decoder answers for asked positions, knowing only where they are
 //! and what the encoder saw. Samples are packed without padding.

@@ -1,5 +1,4 @@
-//! The release's names: what its checkpoints call our modalities and which entries they hold besides our parameters
-//! (model.md 10.2).
+//! The release's names: what its checkpoints call our modalities and which entries they hold besides our parameters.
 //!
 //! Below the modality, our parameters bear the release's names, so the map is one of modality names alone.
 

@@ -1,4 +1,4 @@
-//! Which position table a token grid gets (model.md 1.4); the tables are [`crate::nn::positions`].
+//! Which position table a token grid gets; the tables are [`crate::nn::positions`].
 //!
 //! One axis is camera and gaze, two axes are time by joints, three are video. For time by joints the released table runs
 //! through the grid the other way round than the tokens do: [`Positions::Released`] keeps that, as imported weights need it,

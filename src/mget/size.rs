@@ -1,4 +1,4 @@
-//! Model sizes: the contents of `registry/size/*.yaml` (Supp. B, model.md 4.5).
+//! Model sizes: the contents of `registry/size/*.yaml` (Supp. B).
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -43,12 +43,6 @@ impl Size {
         }
     }
 
-    /// Width of one attention head.
-    #[must_use]
-    pub fn head_width(&self) -> usize {
-        self.width / self.heads.max(1)
-    }
-
     /// Parameters of one encoder block: qkv, projection, SwiGLU, two norms.
     #[must_use]
     pub fn encoder_block_parameters(&self) -> usize {
@@ -89,7 +83,7 @@ mod tests {
             decoder_depth: depth,
             hidden: 0,
         };
-        // model.md 4.5.
+        // Counted from the released code.
         assert_eq!(size(384, 6, 6).trunk_parameters(), 24_935_424);
         assert_eq!(size(512, 8, 8).trunk_parameters(), 59_000_832);
         assert_eq!(size(768, 12, 12).trunk_parameters(), 198_829_056);

@@ -1,4 +1,4 @@
-//! What a model is made of: size, modalities and their grids, and from that every parameter by name (model.md 4.5).
+//! What a model is made of: size, modalities and their grids, and from that every parameter by name.
 //!
 //! A [`MgetSpec`] is stored with the weights; nothing here allocates a parameter, so a plan can count any size.
 
@@ -50,6 +50,20 @@ pub enum Input {
     },
 }
 
+/// Tokens of one modality and sample, at most: position tables are made for all of them.
+const MOST_TOKENS: usize = 1 << 20;
+/// The largest width, also within the SwiGLU.
+const MOST_WIDTH: usize = 1 << 16;
+/// The most blocks of encoder and decoder.
+const MOST_DEPTH: usize = 1 << 10;
+
+/// The product of sizes; `None` where it is no `usize`.
+fn product(sizes: &[usize]) -> Option<usize> {
+    sizes
+        .iter()
+        .try_fold(1_usize, |product, size| product.checked_mul(*size))
+}
+
 /// Why a model cannot be built.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum SpecError {
@@ -79,6 +93,8 @@ pub enum SpecError {
         modality: String,
         what: &'static str,
     },
+    #[error("`{modality}`: {sizes:?} is too large, a sample has at most {MOST_TOKENS} tokens")]
+    TooMany { modality: String, sizes: Vec<usize> },
     #[error("modality `{0}` appears twice")]
     Twice(String),
     #[error("modality name `{0}` is empty or holds a dot or a blank")]
@@ -87,6 +103,10 @@ pub enum SpecError {
     NothingToPredict,
     #[error("the model's size has a zero: {0:?}")]
     ZeroSize(Size),
+    #[error(
+        "the model's size is out of range, widths to {MOST_WIDTH} and depths to {MOST_DEPTH}: {0:?}"
+    )]
+    HugeSize(Size),
     #[error("`{modality}` has no position table of this width")]
     NoTable { modality: String },
 }
@@ -182,6 +202,16 @@ impl ModalitySpec {
                 what: "grid",
             });
         }
+        let sizes = match self.input {
+            Input::Tokens { .. } => grid.clone(),
+            Input::Pixels { clip, .. } => clip.to_vec(),
+        };
+        if product(&sizes).is_none() || product(&grid).is_none_or(|tokens| tokens > MOST_TOKENS) {
+            return Err(SpecError::TooMany {
+                modality: modality(),
+                sizes,
+            });
+        }
         if !width.is_multiple_of(divisor) {
             return Err(SpecError::Width {
                 width,
@@ -205,10 +235,13 @@ impl MgetSpec {
             heads,
             encoder_depth,
             decoder_depth,
-            ..
+            hidden,
         } = self.size;
         if [width, heads, encoder_depth, decoder_depth].contains(&0) {
             return Err(SpecError::ZeroSize(self.size));
+        }
+        if width.max(hidden) > MOST_WIDTH || encoder_depth.max(decoder_depth) > MOST_DEPTH {
+            return Err(SpecError::HugeSize(self.size));
         }
         if !width.is_multiple_of(heads) {
             return Err(SpecError::Heads { width, heads });
@@ -340,7 +373,7 @@ impl MgetSpec {
     }
 
     /// Multiply-accumulates of one forward pass over a sample with `inputs` visible and `targets` asked tokens, the targets
-    /// spread over modalities as `targets_of` says (model.md 4.7).
+    /// spread over modalities as `targets_of` says.
     #[must_use]
     pub fn multiply_accumulates(&self, inputs: usize, targets_of: &[usize]) -> f64 {
         let (d, h) = (self.size.width as f64, self.size.hidden() as f64);
@@ -419,7 +452,7 @@ mod tests {
 
     #[test]
     fn forward_cost_is_that_of_the_reference() {
-        // model.md 4.7: 0.64 T trunk and 0.10 T logits at 2048 in, 2048 targets of one 64 000-entry modality.
+        // By hand from the sizes: 0.64 T trunk and 0.10 T logits at 2048 in, 2048 targets of one 64 000-entry modality.
         let spec = spec((768, 12, 12), 2048, true);
         let mut targets = vec![0; spec.modalities.len()];
         targets[spec.index("rgb").unwrap()] = 2048;
@@ -441,6 +474,21 @@ mod tests {
             "{six}"
         );
         assert!(message(|s| (s.size.width, s.size.heads) = (2046, 31)).contains("divisible by 4"));
+        let grid = |grid: [usize; 3]| {
+            let mut spec = spec((768, 12, 12), 1024, true);
+            spec.modalities[5] = ModalitySpec::tokens("rgb", &grid, 64_000);
+            spec.check()
+        };
+        assert_eq!(grid([4, 512, 512]), Ok(()));
+        for huge in [[4, 512, 513], [3, 1 << 20, 1 << 20], [usize::MAX; 3]] {
+            let message = grid(huge).unwrap_err().to_string();
+            assert!(message.contains("at most 1048576 tokens"), "{message}");
+        }
+        let huge = ModalitySpec::pixels("p", [1, 1 << 40, 1 << 40, 1], [1, 1 << 40, 1 << 40]);
+        let mut pixels = spec((768, 12, 12), 1024, true);
+        pixels.modalities[7] = huge;
+        assert!(matches!(pixels.check(), Err(SpecError::TooMany { .. })));
+        assert!(message(|s| s.size.encoder_depth = 1 << 40).contains("out of range"));
         assert!(message(|s| s.modalities.truncate(0)).contains("nothing to predict"));
         assert!(message(|s| s.modalities[0].name = "camera".into()).contains("twice"));
         assert!(message(|s| s.modalities[0].name = "a.b".into()).contains("dot"));

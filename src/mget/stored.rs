@@ -74,6 +74,10 @@ impl Mget {
     pub fn open(directory: &Path, compute: &Compute) -> Result<Self, StoredError> {
         let path = directory.join(SPEC);
         let spec = read_spec(directory)?;
+        spec.check().map_err(|error| StoredError::Spec {
+            path: path.clone(),
+            error,
+        })?;
         let weights = Weights::read(&directory.join(WEIGHTS))?;
         // The file has every table in full: a description that asks for more than is there is refused before it is built.
         for (name, shape) in spec.parameters() {
@@ -85,5 +89,51 @@ impl Mget {
         })?;
         model.load(&weights)?;
         Ok(model)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::engine::Initialise;
+    use crate::mget::{ModalitySpec, Positions, Size};
+
+    #[test]
+    fn a_description_that_asks_for_the_moon_is_refused_before_anything_is_built() {
+        let compute = Compute::cpu();
+        let spec = MgetSpec {
+            size: Size {
+                width: 12,
+                heads: 2,
+                encoder_depth: 1,
+                decoder_depth: 1,
+                hidden: 0,
+            },
+            positions: Positions::Aligned,
+            modalities: vec![ModalitySpec::tokens("rgb", &[2, 2, 2], 8)],
+        };
+        let folder = tempfile::tempdir().unwrap();
+        let model = Mget::new(&spec, &Initialise::new(&compute, 0)).unwrap();
+        model.save(folder.path()).unwrap();
+        Mget::open(folder.path(), &compute).unwrap();
+        let refused = |change: fn(&mut MgetSpec)| {
+            let mut spec = spec.clone();
+            change(&mut spec);
+            let text = serde_json::to_vec(&spec).unwrap();
+            std::fs::write(folder.path().join(SPEC), text).unwrap();
+            Mget::open(folder.path(), &compute).unwrap_err().to_string()
+        };
+        let grid = refused(|s| {
+            s.modalities[0] = ModalitySpec::tokens("rgb", &[3, 1_000_000, 1_000_000], 8);
+        });
+        assert!(
+            grid.contains(SPEC) && grid.contains("1048576 tokens"),
+            "{grid}"
+        );
+        assert!(refused(|s| s.size.decoder_depth = usize::MAX).contains("out of range"));
+        let vocabulary = refused(|s| {
+            s.modalities[0] = ModalitySpec::tokens("rgb", &[2, 2, 2], 1 << 40);
+        });
+        assert!(vocabulary.contains("has shape"), "{vocabulary}");
     }
 }

@@ -9,7 +9,7 @@ pub mod video;
 pub mod vq;
 pub mod whitening;
 
-pub use open::{open, open_on};
+pub use open::open;
 
 use crate::clip::Signal;
 
@@ -40,6 +40,31 @@ pub trait Tokenizer: Send + Sync {
     /// # Errors
     /// When a grid has another shape, or a token is outside the vocabulary.
     fn decode(&self, tokens: &[TokenGrid]) -> Result<Vec<Signal>, TokenizerError>;
+}
+
+/// Checks token grids before `tokenizer` decodes them.
+fn check_tokens(tokenizer: &dyn Tokenizer, tokens: &[TokenGrid]) -> Result<(), TokenizerError> {
+    let modality = || tokenizer.modality().to_owned();
+    let (expected, vocabulary) = (tokenizer.grid(), tokenizer.vocabulary());
+    for (index, grid) in tokens.iter().enumerate() {
+        if grid.grid != expected || grid.ids.len() != expected.iter().product::<usize>() {
+            return Err(TokenizerError::Shape {
+                modality: modality(),
+                index,
+                found: grid.grid.clone(),
+                expected: expected.to_vec(),
+            });
+        }
+        if let Some(token) = grid.ids.iter().find(|id| **id as usize >= vocabulary) {
+            return Err(TokenizerError::Vocabulary {
+                modality: modality(),
+                index,
+                token: *token,
+                vocabulary,
+            });
+        }
+    }
+    Ok(())
 }
 
 /// Why a tokenizer refuses its input.

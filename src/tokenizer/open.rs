@@ -13,14 +13,7 @@ use crate::engine::{Compute, Weights};
 /// # Errors
 /// When there is no `tokenizer.safetensors`, or it is damaged or of an unknown format.
 pub fn open(directory: &Path) -> Result<Box<dyn Tokenizer>, TokenizerError> {
-    open_on(directory, &Compute::cpu())
-}
-
-/// The tokenizer in `directory`, of whichever family, on the device of `compute`.
-///
-/// # Errors
-/// As [`open`].
-pub fn open_on(directory: &Path, compute: &Compute) -> Result<Box<dyn Tokenizer>, TokenizerError> {
+    let compute = &Compute::cpu();
     let path = directory.join(trained::FILE);
     let weights = Weights::read(&path).map_err(|error| TokenizerError::Other(error.to_string()))?;
     let format = weights.metadata.get("format").map(String::as_str);

@@ -8,6 +8,9 @@ use serde::{Deserialize, Serialize};
 use super::TokenizerError;
 use crate::modality::Shape;
 
+/// The largest size of a signal along any axis.
+const MOST: usize = 1 << 20;
+
 /// How signals of one shape are cut.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Patches {
@@ -46,6 +49,11 @@ impl Patches {
             }
         };
         let divides = |size: usize, by: usize| by > 0 && size > 0 && size.is_multiple_of(by);
+        if [samples, joints, channels].iter().any(|size| *size > MOST) {
+            return Err(TokenizerError::Other(format!(
+                "{shape:?} is too large: each size is at most {MOST}"
+            )));
+        }
         if channels == 0 || !divides(samples, patch[0]) || !divides(joints, patch[1]) {
             return Err(TokenizerError::Other(format!(
                 "compression {compression:?} does not divide {shape:?}"

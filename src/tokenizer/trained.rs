@@ -8,10 +8,10 @@ use serde_json::{Value, json};
 
 use super::normaliser::Normaliser;
 use super::vq::{Batch, VqSettings, VqVae};
-use super::{TokenGrid, Tokenizer, TokenizerError};
+use super::{TokenGrid, Tokenizer, TokenizerError, check_tokens};
 use crate::clip::Signal;
 use crate::engine::parameters::to_host;
-use crate::engine::{Compute, HostTensor, Initialise, Parameters, Values, Weights};
+use crate::engine::{Compute, EngineError, HostTensor, Initialise, Parameters, Values, Weights};
 use crate::modality::Shape;
 
 /// The name of the file in a tokenizer's directory.
@@ -172,10 +172,12 @@ impl VqTokenizer {
             }
         };
         let normaliser = Normaliser::new(statistics(MEAN)?, statistics(DEVIATION)?)?;
+        let unfit = |error: EngineError| wrong("weights", error.to_string());
+        VqVae::new(&Initialise::planned(compute), &settings, &shape)?
+            .check_shapes(&weights)
+            .map_err(unfit)?;
         let mut model = VqVae::new(&Initialise::to_load(compute), &settings, &shape)?;
-        model
-            .load(&weights)
-            .map_err(|error| wrong("weights", error.to_string()))?;
+        model.load(&weights).map_err(unfit)?;
         Self::new(&modality, shape, normaliser, &model)
     }
 
@@ -333,28 +335,7 @@ impl Tokenizer for VqTokenizer {
     }
 
     fn decode(&self, tokens: &[TokenGrid]) -> Result<Vec<Signal>, TokenizerError> {
-        for (index, grid) in tokens.iter().enumerate() {
-            if grid.grid != self.grid || grid.ids.len() != self.model.patches().tokens() {
-                return Err(TokenizerError::Shape {
-                    modality: self.modality.clone(),
-                    index,
-                    found: grid.grid.clone(),
-                    expected: self.grid.clone(),
-                });
-            }
-            let outside = grid
-                .ids
-                .iter()
-                .find(|id| **id as usize >= self.vocabulary());
-            if let Some(token) = outside {
-                return Err(TokenizerError::Vocabulary {
-                    modality: self.modality.clone(),
-                    index,
-                    token: *token,
-                    vocabulary: self.vocabulary(),
-                });
-            }
-        }
+        check_tokens(self, tokens)?;
         let shape = self.model.patches().signal_shape();
         let mut signals = Vec::with_capacity(tokens.len());
         for chunk in tokens.chunks(BATCH) {
@@ -485,6 +466,18 @@ mod tests {
             message.contains("has shape") && message.contains("expects"),
             "{message}"
         );
+
+        // More memory than any machine has, or more blocks than can be named: refused before anything is allocated.
+        for (from, to) in [
+            ("\"codebook\":16", "\"codebook\":16777216"),
+            ("\"depth\":1", "\"depth\":1000000000000"),
+        ] {
+            let mut huge = tokenizer().weights();
+            let settings = huge.metadata["settings"].replace(from, to);
+            assert_ne!(settings, huge.metadata["settings"]);
+            huge.metadata.insert("settings".into(), settings);
+            assert!(VqTokenizer::from_weights(huge, &compute).is_err(), "{to}");
+        }
 
         assert!(VqTokenizer::from_weights(Weights::default(), &compute).is_err());
     }

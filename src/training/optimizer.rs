@@ -17,13 +17,13 @@ use crate::engine::{EngineError, Gradients, HostTensor, Parameters, Values, Weig
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct AdamWSettings {
-    /// Decay of the mean and of the mean square of gradients.
+    /// Decay of the mean and of the mean square of gradients; each at least 0 and below 1.
     pub betas: [f64; 2],
-    /// Added to the root of the mean square.
+    /// Added to the root of the mean square; above 0.
     pub epsilon: f64,
-    /// Share of the values lost per step and unit of learning rate; not for norms and biases.
+    /// Share of the values lost per step and unit of learning rate, at least 0; not for norms and biases.
     pub weight_decay: f64,
-    /// Largest norm of all gradients together; larger ones are scaled down. `null`: no limit.
+    /// Largest norm of all gradients together, above 0; larger ones are scaled down. `null`: no limit.
     pub clip_norm: Option<f64>,
 }
 
@@ -35,6 +35,27 @@ impl Default for AdamWSettings {
             weight_decay: 0.05,
             clip_norm: Some(1.0),
         }
+    }
+}
+
+impl AdamWSettings {
+    /// The first setting that is out of its range, if any: a step would be NaN, or go uphill.
+    #[must_use]
+    pub fn wrong(&self) -> Option<&'static str> {
+        // Steps are taken in f32, where a tiny number may be 0.
+        let positive = |value: f64| value.is_finite() && value as f32 > 0.0;
+        let good = [
+            ("betas", self.betas.iter().all(|b| (0.0..1.0).contains(b))),
+            ("epsilon", positive(self.epsilon)),
+            (
+                "weight_decay",
+                self.weight_decay.is_finite() && self.weight_decay >= 0.0,
+            ),
+            ("clip_norm", self.clip_norm.is_none_or(positive)),
+        ];
+        good.into_iter()
+            .find(|(_, good)| !good)
+            .map(|(name, _)| name)
     }
 }
 
@@ -64,6 +85,7 @@ pub struct AdamW {
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[error("the gradient of step {step} is not finite (norm {norm})")]
 pub struct NotFinite {
+    /// Counted from 1.
     pub step: u64,
     pub norm: f64,
 }
@@ -112,7 +134,7 @@ impl AdamW {
         let norm = gradients.norm();
         if !norm.is_finite() {
             return Err(NotFinite {
-                step: self.step,
+                step: self.step + 1,
                 norm,
             });
         }
@@ -264,8 +286,38 @@ mod tests {
         let mut optimizer = AdamW::new(AdamWSettings::default(), &model);
         let nan = Tensor::<1>::from_floats([f32::NAN], compute.device());
         let gradients = Gradients::from_map([("weight".to_owned(), nan)].into());
-        assert!(optimizer.step(&mut model, gradients, 0.1).is_err());
+        let error = optimizer.step(&mut model, gradients, 0.1).unwrap_err();
+        assert!(error.to_string().contains("step 1 "), "{error}");
         assert_eq!((model.weights(), optimizer.steps()), (before, 0));
+    }
+
+    #[test]
+    fn settings_out_of_their_range_are_named() {
+        let wrong = |change: fn(&mut AdamWSettings)| {
+            let mut settings = AdamWSettings::default();
+            change(&mut settings);
+            settings.wrong()
+        };
+        assert_eq!(wrong(|_| ()), None);
+        assert_eq!(wrong(|s| s.betas[0] = 0.0), None);
+        assert_eq!(wrong(|s| s.weight_decay = 0.0), None);
+        assert_eq!(wrong(|s| s.clip_norm = None), None);
+        for beta in [1.0, -0.1, f64::NAN] {
+            let settings = AdamWSettings {
+                betas: [0.9, beta],
+                ..AdamWSettings::default()
+            };
+            assert_eq!(settings.wrong(), Some("betas"), "{beta}");
+        }
+        assert_eq!(wrong(|s| s.epsilon = 0.0), Some("epsilon"));
+        assert_eq!(wrong(|s| s.epsilon = 1e-60), Some("epsilon"));
+        assert_eq!(wrong(|s| s.weight_decay = -0.1), Some("weight_decay"));
+        assert_eq!(wrong(|s| s.clip_norm = Some(-1.0)), Some("clip_norm"));
+        assert_eq!(wrong(|s| s.clip_norm = Some(0.0)), Some("clip_norm"));
+        assert_eq!(
+            wrong(|s| s.clip_norm = Some(f64::INFINITY)),
+            Some("clip_norm")
+        );
     }
 
     #[test]

@@ -14,7 +14,8 @@ pub enum Shape {
     Cosine,
     /// Stays at the peak.
     Constant,
-    /// `sqrt(timescale / (timescale + i))`, then a linear cool-down to the final rate, which is reached.
+    /// `sqrt(timescale / (timescale + i))` with a `timescale` above 0, then a linear cool-down to the final rate, which is
+    /// reached.
     InverseSqrt { timescale: u64, cooldown_steps: u64 },
 }
 

@@ -1,4 +1,4 @@
-//! How MGET is trained (Supp. B; model.md 6).
+//! How MGET is trained (Supp. B).
 
 use super::optimizer::AdamWSettings;
 use super::schedule::{Schedule, ScheduleError, Shape};
@@ -101,6 +101,8 @@ pub enum SettingsError {
     Length,
     #[error("`{0}` must be a positive, finite number")]
     Positive(&'static str),
+    #[error("`{0}` is out of its range")]
+    Range(String),
     #[error(transparent)]
     Schedule(#[from] ScheduleError),
 }
@@ -147,7 +149,7 @@ impl TrainingSettings {
     /// The learning rate of every step.
     ///
     /// # Errors
-    /// When length, warm-up or rates cannot be used.
+    /// When length, warm-up, rates or optimizer cannot be used.
     pub fn learning_rates(&self, measure: Measure) -> Result<Schedule, SettingsError> {
         for (name, value) in [
             ("batch", self.batch),
@@ -160,6 +162,15 @@ impl TrainingSettings {
         }
         if !(self.learning_rate.is_finite() && self.learning_rate > 0.0) {
             return Err(SettingsError::Positive("learning_rate"));
+        }
+        if !(self.final_learning_rate.is_finite() && self.final_learning_rate >= 0.0) {
+            return Err(SettingsError::Range("final_learning_rate".to_owned()));
+        }
+        if matches!(self.schedule, Shape::InverseSqrt { timescale: 0, .. }) {
+            return Err(SettingsError::Positive("schedule.timescale"));
+        }
+        if let Some(name) = self.optimizer.wrong() {
+            return Err(SettingsError::Range(format!("optimizer.{name}")));
         }
         let total = self.total_steps(measure)?;
         let warmup = self
@@ -211,7 +222,7 @@ mod tests {
 
     #[test]
     fn the_paper_s_run_has_its_published_steps() {
-        // model.md 6: 976 steps per epoch, 123 epochs, 2385 steps of warm-up.
+        // The release: 976 steps per epoch, 123 epochs, 2385 steps of warm-up.
         assert_eq!(paper().total_steps(PAPER).unwrap(), 120_048);
         assert_eq!(paper().steps_of(Span::Tokens(10e9), PAPER), Some(2385));
         let rates = paper().learning_rates(PAPER).unwrap();
@@ -232,6 +243,18 @@ mod tests {
         assert!(refused(|s| s.learning_rate = f64::INFINITY));
         assert!(refused(|s| s.batch = 0));
         assert!(refused(|s| s.warmup = Span::Epochs(124.0)));
+        assert!(refused(|s| s.final_learning_rate = f64::NAN));
+        assert!(refused(|s| s.final_learning_rate = -1e-5));
+        assert!(refused(|s| s.optimizer.clip_norm = Some(-1.0)));
+        let timescale = |timescale| {
+            let mut settings = paper();
+            settings.schedule = Shape::InverseSqrt {
+                timescale,
+                cooldown_steps: 10,
+            };
+            settings.learning_rates(PAPER).is_ok()
+        };
+        assert!(timescale(1) && !timescale(0));
     }
 
     #[test]

@@ -1,5 +1,5 @@
 //! Token shards as a data set: `<folder>/<modality>/shard-000000.tar` (or up to three folders further down, as in
-//! `<modality>/<data set>/token/`), one member per clip (model.md 9.5).
+//! `<modality>/<data set>/token/`), one member per clip.
 //!
 //! A member is `<clip>.npy` or `<clip>.npz` (array `arr_0`), integers of any width and of any shape with the right number of
 //! elements. Raw video lies beside the tokens as bytes. A clip whose member is missing from a modality, or whose ids all equal
@@ -23,7 +23,7 @@ const MAX_MEMBER: u64 = 256 << 20;
 #[derive(Debug)]
 pub struct Shards {
     name: String,
-    /// Per modality of the model: its name, its number of values per clip, and its vocabulary (none for raw video).
+    /// Per modality of the model: its name, the shape of its values of a clip, and its vocabulary (none for raw video).
     modalities: Vec<(String, Vec<usize>, Option<usize>)>,
     paths: Vec<PathBuf>,
     /// In order of names; per modality where the member lies.
@@ -49,7 +49,7 @@ impl Shards {
     /// The shards below `folder`, one sub-folder per modality of `spec`.
     ///
     /// # Errors
-    /// When a folder or a shard cannot be read.
+    /// When a folder or a shard cannot be read, or a modality has two clips of one name.
     pub fn open(folder: &Path, name: &str, spec: &MgetSpec) -> Result<Self, DataError> {
         let mut shards = Self {
             name: name.to_owned(),
@@ -68,14 +68,26 @@ impl Shards {
                 .push((modality.name.clone(), shape, modality.vocabulary()));
             for path in tars(&folder.join(&modality.name))? {
                 let shard = shards.paths.len() as u32;
-                for (stem, mut member) in directory(&path)? {
+                let found = directory(&path)?;
+                shards.paths.push(path);
+                for (stem, mut member) in found {
                     member.shard = shard;
                     let entry = members
-                        .entry(stem)
+                        .entry(stem.clone())
                         .or_insert_with(|| vec![None; spec.modalities.len()]);
-                    entry[index] = Some(member);
+                    if let Some(first) = entry[index].replace(member) {
+                        let path = |member: Member| {
+                            let path = &shards.paths[member.shard as usize];
+                            path.display().to_string()
+                        };
+                        return Err(DataError::Twice {
+                            modality: modality.name.clone(),
+                            clip: stem,
+                            first: path(first),
+                            second: path(member),
+                        });
+                    }
                 }
-                shards.paths.push(path);
             }
         }
         shards.clips = members.into_iter().collect();
@@ -176,7 +188,8 @@ impl TokenSource for Shards {
         for ((name, shape, vocabulary), member) in self.modalities.iter().zip(members) {
             let Some(member) = *member else { continue };
             let path = &self.paths[member.shard as usize];
-            sample.shard = path.display().to_string();
+            let shard = path.display().to_string();
+            sample.shards.insert(name.clone(), shard);
             let bytes = self.bytes(member)?;
             let refuse = |error: &dyn std::fmt::Display| {
                 shard_error(path, &format!("{key}, {name}: {error}"))
@@ -264,6 +277,39 @@ mod tests {
             !shards.read(2).unwrap().tokens.contains_key("left_hand"),
             "marked invalid"
         );
+    }
+
+    #[test]
+    fn two_clips_of_one_name_are_refused_with_both_shards() {
+        let folder = tempfile::tempdir().unwrap();
+        write(folder.path(), "camera/first", &[("a", vec![1, 2])]);
+        write(folder.path(), "camera/second", &[("b", vec![1, 2])]);
+        assert_eq!(
+            Shards::open(folder.path(), "set", &spec()).unwrap().len(),
+            2
+        );
+        write(folder.path(), "camera/third", &[("a", vec![5, 6])]);
+        let error = Shards::open(folder.path(), "set", &spec()).unwrap_err();
+        let message = error.to_string();
+        for part in [
+            "`a`",
+            "first/shard-000000.tar",
+            "third/shard-000000.tar",
+            "camera",
+        ] {
+            assert!(message.contains(part), "{message}");
+        }
+    }
+
+    #[test]
+    fn a_token_out_of_its_vocabulary_names_the_shard_of_its_modality() {
+        let folder = tempfile::tempdir().unwrap();
+        write(folder.path(), "camera", &[("a", vec![1, 8])]);
+        write(folder.path(), "left_hand", &[("a", vec![0, 3])]);
+        let shards = Shards::open(folder.path(), "set", &spec()).unwrap();
+        let error = shards.read(0).unwrap().check(&spec()).unwrap_err();
+        let message = error.to_string();
+        assert!(message.contains("camera/shard-000000.tar"), "{message}");
     }
 
     #[test]

@@ -7,8 +7,8 @@ use std::collections::BTreeMap;
 /// The tokens of one clip.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct TokenSample {
-    /// The shard it was read from, for messages.
-    pub shard: String,
+    /// The shard that each modality was read from, for messages; nothing for samples that are made in memory.
+    pub shards: BTreeMap<String, String>,
     /// The clip's name, for messages.
     pub key: String,
     /// By modality; a modality the clip does not have (or that is invalid throughout) is absent.
@@ -61,6 +61,15 @@ pub enum DataError {
         found: usize,
         expected: usize,
     },
+    #[error(
+        "{modality}: clip `{clip}` is in shard {first} and in shard {second}; the clips of one folder need names of their own"
+    )]
+    Twice {
+        modality: String,
+        clip: String,
+        first: String,
+        second: String,
+    },
     #[error("data set `{0}` has no clips")]
     Empty(String),
     #[error("the weights of the data sets are not finite and positive")]
@@ -75,8 +84,12 @@ impl TokenSample {
     /// Checks lengths and vocabularies of every modality of the model that the sample has.
     ///
     /// # Errors
-    /// When one does not fit; the error names shard, sample and modality.
+    /// When one does not fit; the error names the modality, its shard and the sample.
     pub fn check(&self, spec: &MgetSpec) -> Result<(), DataError> {
+        let shard = |modality: &ModalitySpec| {
+            let shard = self.shards.get(&modality.name);
+            shard.map_or_else(|| "in memory".to_owned(), Clone::clone)
+        };
         for modality in &spec.modalities {
             let expected = modality.count();
             let found = match self.content(modality) {
@@ -85,7 +98,7 @@ impl TokenSample {
                     let vocabulary = modality.vocabulary().unwrap_or(0);
                     if let Some(token) = ids.iter().find(|id| **id as usize >= vocabulary) {
                         return Err(DataError::Vocabulary {
-                            shard: self.shard.clone(),
+                            shard: shard(modality),
                             sample: self.key.clone(),
                             modality: modality.name.clone(),
                             token: *token,
@@ -99,7 +112,7 @@ impl TokenSample {
             };
             if found != expected {
                 return Err(DataError::Length {
-                    shard: self.shard.clone(),
+                    shard: shard(modality),
                     sample: self.key.clone(),
                     modality: modality.name.clone(),
                     found,
@@ -186,7 +199,7 @@ mod tests {
             modalities: vec![ModalitySpec::tokens("gaze", &[3], 10)],
         };
         let sample = |ids: &[u32]| TokenSample {
-            shard: "train-000002.tar".into(),
+            shards: [("gaze".to_owned(), "train-000002.tar".to_owned())].into(),
             key: "world/0017".into(),
             tokens: [(
                 "gaze".to_owned(),

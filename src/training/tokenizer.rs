@@ -3,16 +3,16 @@
 //! Everything a step does is a function of the seed, the step and the state: the clips it sees, the codes it replaces, the
 //! learning rate. A checkpoint is weights, moments and the step.
 
-use std::collections::BTreeMap;
-
+use ndarray::Ix3;
 use rand::seq::SliceRandom;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use super::optimizer::{AdamW, AdamWSettings};
+use super::optimizer::{AdamW, AdamWSettings, NotFinite};
 use super::schedule::{Schedule, ScheduleError, Shape};
 use crate::clip::Signal;
 use crate::engine::{EngineError, Gradients, Parameters, Weights};
+use crate::geometry::skeleton::HAND;
 use crate::random::stream;
 use crate::tokenizer::TokenizerError;
 use crate::tokenizer::trained::{Prepared, batch};
@@ -67,8 +67,11 @@ pub struct StepReport {
 /// Why a step or a resume was refused.
 #[derive(Debug, thiserror::Error)]
 pub enum TrainingError {
+    /// Steps are counted from 1.
     #[error("the loss of step {step} is {loss}; the last good checkpoint is kept")]
     NotFinite { step: u64, loss: f64 },
+    #[error("{0}; the last good checkpoint is kept")]
+    Gradient(#[from] NotFinite),
     #[error("there is nothing to train on")]
     NoData,
     #[error(transparent)]
@@ -185,17 +188,12 @@ impl Trainer {
         let weight = self.model.settings().commitment;
         let loss = trained.reconstruction + weight * trained.commitment;
         if !loss.is_finite() {
+            let step = step + 1;
             return Err(TrainingError::NotFinite { step, loss });
         }
         let gradients = Gradients::of(&trained.loss, &self.model);
         let rate = self.schedule.rate(step);
-        let gradient_norm = self
-            .optimizer
-            .step(&mut self.model, gradients, rate)
-            .map_err(|error| TrainingError::NotFinite {
-                step,
-                loss: error.norm,
-            })?;
+        let gradient_norm = self.optimizer.step(&mut self.model, gradients, rate)?;
         let quantizer = self.model.quantizer_mut();
         let sums = quantizer.sums(&trained.assignment);
         let update = quantizer.update(&sums, &trained.assignment.unit, self.seed, step);
@@ -231,43 +229,15 @@ impl Trainer {
 
 /// Joints seen in a mirror: x (right) is negated, in the camera's frame. Left and right hands use the same list of joints, so
 /// a mirrored left hand is a right hand (Supp. A).
-#[must_use]
-pub fn mirrored(signal: &Signal) -> Signal {
-    let mut mirrored = signal.clone();
-    for x in mirrored.values.iter_mut().step_by(3) {
-        *x = -*x;
-    }
-    mirrored
-}
-
-/// How a codebook is used over a whole split.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Usage {
-    /// Share of codes that occur at all.
-    pub used: f64,
-    /// `exp` of the entropy of their frequencies.
-    pub perplexity: f64,
-}
-
-/// Usage of a vocabulary by tokens.
-#[must_use]
-pub fn usage(tokens: impl IntoIterator<Item = u32>, vocabulary: usize) -> Usage {
-    let mut counts: BTreeMap<u32, u64> = BTreeMap::new();
-    for token in tokens {
-        *counts.entry(token).or_default() += 1;
-    }
-    let total: u64 = counts.values().sum();
-    let entropy: f64 = counts
-        .values()
-        .map(|count| {
-            let share = *count as f64 / total as f64;
-            -share * share.ln()
-        })
-        .sum();
-    Usage {
-        used: counts.len() as f64 / vocabulary as f64,
-        perplexity: entropy.exp(),
-    }
+///
+/// # Errors
+/// When the signal is not `[samples, joints, 3]`.
+pub fn mirrored(signal: &Signal) -> Result<Signal, ndarray::ShapeError> {
+    let joints = signal.values.clone().into_dimensionality::<Ix3>()?;
+    Ok(Signal {
+        values: HAND.mirrored(&joints).into_dyn(),
+        valid: signal.valid.clone(),
+    })
 }
 
 #[cfg(test)]
@@ -372,8 +342,14 @@ mod tests {
             valid: None,
         }];
         let error = trainer.step(&huge).unwrap_err();
-        assert!(error.to_string().contains("step 1"), "{error}");
+        assert!(error.to_string().contains("loss of step 2 is"), "{error}");
         assert_eq!(trainer.checkpoint(), before);
+        let gradient = NotFinite {
+            step: 2,
+            norm: f64::INFINITY,
+        };
+        let message = TrainingError::from(gradient).to_string();
+        assert!(message.contains("gradient of step 2"), "{message}");
     }
 
     #[test]
@@ -391,9 +367,17 @@ mod tests {
     }
 
     #[test]
-    fn usage_of_a_vocabulary_counts_codes_and_their_evenness() {
-        let even = usage((0..8).cycle().take(80), 16);
-        assert!((even.used - 0.5).abs() < 1e-12 && (even.perplexity - 8.0).abs() < 1e-9);
-        assert!((usage([3, 3, 3], 16).perplexity - 1.0).abs() < 1e-12);
+    fn the_other_hand_in_a_mirror_is_turned_around_and_back() {
+        let joints = ndarray::Array3::from_shape_fn((2, 21, 3), |(t, j, k)| {
+            (t + 3 * j + 7 * k) as f32 - 20.0
+        });
+        let signal = Signal {
+            values: joints.into_dyn(),
+            valid: None,
+        };
+        let once = mirrored(&signal).unwrap();
+        assert_eq!(once.values[[1, 4, 0]], -signal.values[[1, 4, 0]]);
+        assert_eq!(once.values[[1, 4, 2]], signal.values[[1, 4, 2]]);
+        assert_eq!(mirrored(&once).unwrap(), signal);
     }
 }

@@ -1,4 +1,4 @@
-//! One training step, and the state between steps (Supp. B; model.md 6).
+//! One training step, and the state between steps (Supp. B).
 
 use super::optimizer::{AdamW, NotFinite};
 use super::schedule::Schedule;
@@ -7,7 +7,6 @@ use super::source::DataError;
 use crate::engine::{EngineError, Gradients, Parameters, Weights};
 use crate::mget::{Batch, Loss, LossValues, Mget};
 use serde::{Deserialize, Serialize};
-use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// A model in training.
@@ -130,7 +129,8 @@ impl Trainer {
             }
         }
         let learning_rate = self.schedule.rate(self.progress.step);
-        let gradients = sum.unwrap_or_else(|| self.zeros());
+        let mut gradients = sum.unwrap_or_default();
+        gradients.complete(&self.model);
         let gradient_norm = self
             .optimizer
             .step(&mut self.model, gradients, learning_rate)?;
@@ -155,16 +155,6 @@ impl Trainer {
         let total = losses.total.filter(|_| values.total.is_finite());
         let gradients = total.map(|total| Gradients::of(&(total * share), &self.model));
         (values, gradients)
-    }
-
-    fn zeros(&self) -> Gradients {
-        let mut zeros = BTreeMap::new();
-        self.model.visit("", &mut |name, parameter| {
-            if parameter.is_tracked() {
-                zeros.insert(name.to_owned(), parameter.untracked().zeros_like());
-            }
-        });
-        Gradients::from_map(zeros)
     }
 
     /// The model.

@@ -130,13 +130,15 @@ pub struct Unigram {
 }
 
 impl Unigram {
-    /// Counts the tokens of at most `clips` clips, spread evenly over each source.
+    /// Counts the tokens of at most `clips` clips, spread evenly over the first clips of each source that are trained on:
+    /// `lengths`, one per source.
     ///
     /// # Errors
     /// When a clip cannot be read or does not fit the model.
     pub fn fit(
         spec: &MgetSpec,
         sources: &[std::sync::Arc<dyn TokenSource>],
+        lengths: &[usize],
         clips: usize,
     ) -> Result<Self, DataError> {
         let mut counts: BTreeMap<String, Vec<u64>> = spec
@@ -144,9 +146,10 @@ impl Unigram {
             .iter()
             .filter_map(|modality| Some((modality.name.clone(), vec![1; modality.vocabulary()?])))
             .collect();
-        for source in sources {
-            let stride = source.len().div_ceil(clips.max(1)).max(1);
-            for clip in (0..source.len()).step_by(stride) {
+        for (source, length) in sources.iter().zip(lengths) {
+            let length = source.len().min(*length);
+            let stride = length.div_ceil(clips.max(1)).max(1);
+            for clip in (0..length).step_by(stride) {
                 let sample = source.read(clip)?;
                 sample.check(spec)?;
                 for (name, counts) in &mut counts {

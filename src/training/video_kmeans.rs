@@ -6,8 +6,8 @@ use super::kmeans::{Centres, PATCHES, ROUNDS};
 use crate::clip::Signal;
 use crate::random::stream;
 use crate::tokenizer::Tokenizer;
-use crate::tokenizer::video::VideoTokenizer;
 use crate::tokenizer::video::padding::Padding;
+use crate::tokenizer::video::{VideoTokenizer, haar};
 
 /// Multiply-accumulates to spend on fitting; codebooks of tens of thousands have no such baseline.
 const WORK: usize = 200_000_000_000;
@@ -31,42 +31,20 @@ impl Blocks {
         self.temporal * self.spatial * self.spatial * COLOURS
     }
 
-    /// Calls `visit(place in the blocks, place in the padded clip)` for every run of `spatial * COLOURS` values; the first
-    /// frame stands for a whole group.
-    fn runs(&self, mut visit: impl FnMut(usize, usize)) {
+    /// The padded clip.
+    fn size(&self) -> [usize; 4] {
         let [frames, height, width] = self.padding.padded;
-        let run = self.spatial * COLOURS;
-        let mut place = 0;
-        for group in 0..=((frames - 1) / self.temporal) {
-            for top in (0..height).step_by(self.spatial) {
-                for left in (0..width).step_by(self.spatial) {
-                    for frame in 0..self.temporal {
-                        let frame =
-                            (group * self.temporal + frame).saturating_sub(self.temporal - 1);
-                        for y in top..top + self.spatial {
-                            visit(place, ((frame * height + y) * width + left) * COLOURS);
-                            place += run;
-                        }
-                    }
-                }
-            }
-        }
+        [frames, height, width, COLOURS]
     }
 
     /// `[blocks, width]`.
     fn cut(&self, clip: &[f32]) -> Vec<f32> {
         let padded = self.padding.pad(clip, COLOURS);
-        let run = self.spatial * COLOURS;
-        let mut rows = Vec::new();
-        self.runs(|_, at| rows.extend_from_slice(&padded[at..at + run]));
-        rows
+        haar::cut(&padded, self.size(), [self.temporal, self.spatial])
     }
 
     fn paste(&self, rows: &[f32]) -> Vec<f32> {
-        let [frames, height, width] = self.padding.padded;
-        let run = self.spatial * COLOURS;
-        let mut padded = vec![0.0; frames * height * width * COLOURS];
-        self.runs(|place, at| padded[at..at + run].copy_from_slice(&rows[place..place + run]));
+        let padded = haar::paste(rows, self.size(), [self.temporal, self.spatial]);
         self.padding.crop(&padded, COLOURS)
     }
 }
@@ -131,23 +109,12 @@ impl VideoKMeans {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::engine::{Compute, Initialise};
-    use crate::tokenizer::video::{Network, VideoSettings};
+    use crate::tokenizer::video::testing::small;
     use ndarray::{ArrayD, IxDyn};
     use std::convert::Infallible;
 
     fn tokenizer(levels: &[usize]) -> VideoTokenizer {
-        let settings = VideoSettings {
-            channels: 4,
-            multipliers: vec![1, 2],
-            blocks: 1,
-            latent_channels: 4,
-            levels: levels.to_vec(),
-            ..VideoSettings::default()
-        };
-        let compute = Compute::cpu();
-        let network = Network::new(&Initialise::new(&compute, 2), &settings).unwrap();
-        VideoTokenizer::new("rgb", [5, 16, 24], network, &compute).unwrap()
+        small([5, 16, 24], [4, 4], levels, 2)
     }
 
     fn clip(seed: usize) -> Signal {

@@ -42,7 +42,6 @@ fn clips(count: u64, seed: u64) -> InMemory {
                 grid: vec![6],
             };
             TokenSample {
-                shard: "memory".into(),
                 key: format!("clip-{clip}"),
                 // Every fifth clip has no gaze.
                 tokens: [("camera", grid(0, 16)), ("gaze", grid(3, 12))]
@@ -51,6 +50,7 @@ fn clips(count: u64, seed: u64) -> InMemory {
                     .map(|(name, grid)| (name.to_owned(), grid))
                     .collect(),
                 pixels: [("pixels".to_owned(), vec![(start * 20) as u8; 96])].into(),
+                ..TokenSample::default()
             }
         })
         .collect();
@@ -207,7 +207,7 @@ fn a_small_model_beats_the_unigram_baseline_on_every_modality() {
     setup.run(&mut trainer, 0..300).unwrap();
     let held_out = clips(48, 2);
     let validation = Validation::new(&spec(), &Setup::masking(), &held_out, 48, 16, 0).unwrap();
-    let unigram = Unigram::fit(&spec(), std::slice::from_ref(&setup.source), 64).unwrap();
+    let unigram = Unigram::fit(&spec(), std::slice::from_ref(&setup.source), &[64], 64).unwrap();
     let baseline = validation.baseline(&unigram);
     let scores = validation.run(trainer.model());
     assert_eq!(scores.keys().collect::<Vec<_>>(), ["camera", "gaze"]);
@@ -219,6 +219,27 @@ fn a_small_model_beats_the_unigram_baseline_on_every_modality() {
             baseline[&name]
         );
     }
+}
+
+#[test]
+fn the_unigram_baseline_counts_only_clips_that_are_trained_on() {
+    let all = clips(64, 1);
+    let first = InMemory {
+        samples: all.samples[..10].to_vec(),
+        ..all.clone()
+    };
+    let fit = |source: InMemory, length: usize, clips: usize| {
+        let sources: [Arc<dyn TokenSource>; 1] = [Arc::new(source)];
+        Unigram::fit(&spec(), &sources, &[length], clips).unwrap()
+    };
+    for clips in [4, 64] {
+        assert_eq!(
+            fit(all.clone(), 10, clips),
+            fit(first.clone(), 10, clips),
+            "{clips}"
+        );
+    }
+    assert_ne!(fit(all.clone(), 10, 64), fit(all, 64, 64));
 }
 
 #[test]

@@ -1,9 +1,9 @@
 //! Every operation composed of the tensor library's own: what runs on GPU back ends, and what fused ones are tested against.
 
-use burn::tensor::{Tensor, activation};
+use burn::tensor::{Int, Tensor, TensorData, activation};
 
 use super::super::Segments;
-use super::{AdamWStep, indices};
+use super::{AdamWStep, FRAME_NORM_EPSILON, Taps, indices};
 
 pub fn linear(x: Tensor<2>, weight: Tensor<2>, bias: Option<Tensor<1>>) -> Tensor<2> {
     let y = x.matmul(weight.transpose());
@@ -99,6 +99,47 @@ pub fn cross_entropy(logits: Tensor<2>, targets: &[u32]) -> Tensor<1> {
         .gather(1, targets)
         .reshape([rows])
         .neg()
+}
+
+pub fn convolve(x: Tensor<2>, weight: Tensor<2>, bias: Tensor<1>, taps: Taps) -> Tensor<2> {
+    let ([rows, channels], outputs) = (x.dims(), weight.dims()[0]);
+    let device = x.device();
+    let sources: Vec<i64> = (0..taps.rows_out())
+        .flat_map(|row| {
+            (0..taps.count()).map(move |tap| taps.source(row, tap).unwrap_or(rows) as i64)
+        })
+        .collect();
+    let length = sources.len();
+    let sources: Tensor<1, Int> = Tensor::from_data(
+        TensorData::new(sources, [length]),
+        &device.clone().without_autodiff(),
+    );
+    let padded = Tensor::cat(vec![x, Tensor::zeros([1, channels], &device)], 0);
+    let columns = padded
+        .select(0, sources)
+        .reshape([taps.rows_out(), taps.count() * channels]);
+    let weight = weight
+        .reshape([outputs, channels, taps.count()])
+        .swap_dims(1, 2)
+        .reshape([outputs, taps.count() * channels]);
+    columns.matmul(weight.transpose()) + bias.reshape([1, outputs])
+}
+
+pub fn frame_norm(
+    x: Tensor<2>,
+    weight: Tensor<1>,
+    bias: Tensor<1>,
+    frames: usize,
+    silu: bool,
+) -> Tensor<2> {
+    let [rows, channels] = x.dims();
+    let x = x.reshape([frames, rows / frames * channels]);
+    let centred = x.clone() - x.mean_dim(1);
+    let variance = centred.clone().square().mean_dim(1);
+    let y = (centred / (variance + FRAME_NORM_EPSILON).sqrt()).reshape([rows, channels])
+        * weight.reshape([1, channels])
+        + bias.reshape([1, channels]);
+    if silu { activation::silu(y) } else { y }
 }
 
 pub fn sum_of_squares(x: Tensor<1>) -> f64 {

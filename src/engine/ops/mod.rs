@@ -4,21 +4,22 @@
 //! checkpoints.
 
 mod composed;
-mod convolution;
-mod frame_norm;
 mod fused;
 mod gemm;
 mod nearest;
+mod taps;
 mod vector;
 
-pub use convolution::{Taps, convolve};
-pub use frame_norm::frame_norm;
 pub use nearest::nearest;
+pub use taps::Taps;
 
 use burn::tensor::{Int, Tensor, TensorData};
 
 use super::Segments;
 use fused::Fused;
+
+/// Added to the variance of a frame.
+const FRAME_NORM_EPSILON: f32 = 1e-6;
 
 /// An input that an operation does not have.
 const NONE: Option<Tensor<1>> = None;
@@ -136,6 +137,43 @@ pub fn tied_cross_entropy(x: Tensor<2>, table: Tensor<2>, targets: &[u32]) -> Te
         return fused::run(Fused::TiedCrossEntropy { targets }, x, Some(table), NONE);
     }
     composed::cross_entropy(composed::linear(x, table, None), targets)
+}
+
+/// A factorised causal convolution over video on packed rows: `x` `[N, C]`, one row per pixel of
+/// `[samples, frames, height, width]`, by `weight` `[O, C * taps]` (channel by tap, as in checkpoints) plus `bias` `[O]`:
+/// `[N', O]`.
+///
+/// # Panics
+/// When `x` does not have the rows that `taps` speaks of.
+#[must_use]
+pub fn convolve(x: Tensor<2>, weight: Tensor<2>, bias: Tensor<1>, taps: Taps) -> Tensor<2> {
+    assert_eq!(x.dims()[0], taps.rows_in(), "{taps:?}");
+    assert_eq!(weight.dims()[1], x.dims()[1] * taps.count(), "{taps:?}");
+    if fused::takes(&x) {
+        return fused::run(Fused::Convolution { taps }, x, Some(weight), Some(bias));
+    }
+    composed::convolve(x, weight, bias, taps)
+}
+
+/// Each of `frames` frames of packed rows `[frames * pixels, channels]` to mean 0 and variance 1 (group norm with one group),
+/// times `weight` plus `bias` (per channel), then SiLU if `silu`.
+///
+/// # Panics
+/// When the rows do not divide into `frames`.
+#[must_use]
+pub fn frame_norm(
+    x: Tensor<2>,
+    weight: Tensor<1>,
+    bias: Tensor<1>,
+    frames: usize,
+    silu: bool,
+) -> Tensor<2> {
+    assert!(frames > 0 && x.dims()[0].is_multiple_of(frames), "{frames}");
+    if fused::takes(&x) {
+        let operation = Fused::FrameNorm { frames, silu };
+        return fused::run(operation, x, Some(weight), Some(bias));
+    }
+    composed::frame_norm(x, weight, bias, frames, silu)
 }
 
 /// The rows `ids` of `table` `[V, D]`: `[N, D]`.

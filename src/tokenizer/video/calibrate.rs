@@ -150,8 +150,8 @@ impl Moments {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::engine::{Compute, Initialise};
-    use crate::tokenizer::video::{Network, VideoSettings};
+    use crate::engine::Compute;
+    use crate::tokenizer::video::testing::small;
     use burn::tensor::TensorData;
     use ndarray::{ArrayD, IxDyn};
 
@@ -168,17 +168,7 @@ mod tests {
 
     #[test]
     fn a_token_starts_as_a_matter_of_its_own_block() {
-        let settings = VideoSettings {
-            channels: 16,
-            multipliers: vec![1, 2],
-            blocks: 1,
-            latent_channels: 8,
-            levels: vec![8, 5, 5],
-            ..VideoSettings::default()
-        };
-        let compute = Compute::cpu();
-        let network = Network::new(&Initialise::new(&compute, 4), &settings).unwrap();
-        let mut tokenizer = VideoTokenizer::new("rgb", [5, 32, 32], network, &compute).unwrap();
+        let mut tokenizer = small([5, 32, 32], [16, 8], &[8, 5, 5], 4);
         let clips: Vec<Signal> = (0..4).map(noise).collect();
         tokenizer.calibrate(&clips).unwrap();
 

@@ -14,7 +14,7 @@
 #[must_use]
 pub fn forward(video: &[f32], size: [usize; 4], patch: usize) -> Vec<f32> {
     let colours = size[3];
-    let blocks = cut(video, size, patch);
+    let blocks = cut(video, size, [patch; 2]);
     let matrix = matrix(patch);
     let pixels = patch.pow(3);
     let mut out = vec![0.0; blocks.len()];
@@ -60,7 +60,7 @@ pub fn inverse(coefficients: &[f32], size: [usize; 4], patch: usize) -> Vec<f32>
             }
         }
     }
-    paste(&blocks, size, patch)
+    paste(&blocks, size, [patch; 2])
 }
 
 /// The map from pixels of a block (`[patch^3 * colours]`, as [`cut`] has them) to coefficients, `[out, in]` row-major.
@@ -80,24 +80,31 @@ pub fn block_matrix(patch: usize, colours: usize) -> Vec<f32> {
     out
 }
 
-/// Blocks of pixels, `[blocks, patch, patch, patch, colours]`, the first frame repeated.
+/// Blocks of `time` frames of `side` by `side` pixels, `[blocks, time, side, side, colours]`, the first frame repeated.
+///
+/// # Panics
+/// When the sizes do not divide.
 #[must_use]
-pub fn cut(video: &[f32], [frames, height, width, colours]: [usize; 4], patch: usize) -> Vec<f32> {
-    let extra = patch - 1;
+pub fn cut(
+    video: &[f32],
+    [frames, height, width, colours]: [usize; 4],
+    [time, side]: [usize; 2],
+) -> Vec<f32> {
+    let extra = time - 1;
     assert_eq!(video.len(), frames * height * width * colours);
-    let grid = [frames + extra, height, width].map(|n| {
-        assert!(n.is_multiple_of(patch), "{n} in blocks of {patch}");
-        n / patch
+    let grid = [(frames + extra, time), (height, side), (width, side)].map(|(n, by)| {
+        assert!(n.is_multiple_of(by), "{n} in blocks of {by}");
+        n / by
     });
     let mut out = Vec::with_capacity((frames + extra) * height * width * colours);
-    let run = patch * colours;
+    let run = side * colours;
     for t in 0..grid[0] {
         for h in 0..grid[1] {
             for w in 0..grid[2] {
-                for dt in 0..patch {
-                    let frame = (t * patch + dt).saturating_sub(extra);
-                    for dh in 0..patch {
-                        let at = ((frame * height + h * patch + dh) * width + w * patch) * colours;
+                for dt in 0..time {
+                    let frame = (t * time + dt).saturating_sub(extra);
+                    for dh in 0..side {
+                        let at = ((frame * height + h * side + dh) * width + w * side) * colours;
                         out.extend_from_slice(&video[at..at + run]);
                     }
                 }
@@ -112,23 +119,23 @@ pub fn cut(video: &[f32], [frames, height, width, colours]: [usize; 4], patch: u
 pub fn paste(
     blocks: &[f32],
     [frames, height, width, colours]: [usize; 4],
-    patch: usize,
+    [time, side]: [usize; 2],
 ) -> Vec<f32> {
-    let extra = patch - 1;
-    let grid = [(frames + extra) / patch, height / patch, width / patch];
-    let run = patch * colours;
+    let extra = time - 1;
+    let grid = [(frames + extra) / time, height / side, width / side];
+    let run = side * colours;
     let mut out = vec![0.0; frames * height * width * colours];
     let mut pieces = blocks.chunks_exact(run);
     for t in 0..grid[0] {
         for h in 0..grid[1] {
             for w in 0..grid[2] {
-                for dt in 0..patch {
-                    let frame = (t * patch + dt).checked_sub(extra);
-                    for dh in 0..patch {
+                for dt in 0..time {
+                    let frame = (t * time + dt).checked_sub(extra);
+                    for dh in 0..side {
                         let piece = pieces.next().unwrap_or_default();
                         if let Some(frame) = frame {
                             let at =
-                                ((frame * height + h * patch + dh) * width + w * patch) * colours;
+                                ((frame * height + h * side + dh) * width + w * side) * colours;
                             out[at..at + run].copy_from_slice(piece);
                         }
                     }
@@ -220,7 +227,7 @@ mod tests {
             }
             let side = patch.pow(3) * 3;
             let matrix = block_matrix(patch, 3);
-            let block = &cut(&video, size, patch)[..side];
+            let block = &cut(&video, size, [patch; 2])[..side];
             for (row, expected) in matrix.chunks_exact(side).zip(&y) {
                 let sum: f32 = row.iter().zip(block).map(|(a, b)| a * b).sum();
                 assert!((sum - expected).abs() < 1e-6);

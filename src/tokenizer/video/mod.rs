@@ -22,3 +22,29 @@ pub use fsq::Fsq;
 pub use network::Network;
 pub use settings::VideoSettings;
 pub use tokenizer::{VideoTokenizer, psnr};
+
+#[cfg(test)]
+pub(crate) mod testing {
+    use super::{Network, VideoSettings, VideoTokenizer};
+    use crate::engine::{Compute, Initialise};
+
+    /// A tokenizer of colour clips of `[frames, height, width]` that trains in moments, with as many channels and latents.
+    pub(crate) fn small(
+        clip: [usize; 3],
+        [channels, latent_channels]: [usize; 2],
+        levels: &[usize],
+        seed: u64,
+    ) -> VideoTokenizer {
+        let settings = VideoSettings {
+            channels,
+            multipliers: vec![1, 2],
+            blocks: 1,
+            latent_channels,
+            levels: levels.to_vec(),
+            ..VideoSettings::default()
+        };
+        let compute = Compute::cpu();
+        let network = Network::new(&Initialise::new(&compute, seed), &settings).unwrap();
+        VideoTokenizer::new("rgb", clip, network, &compute).unwrap()
+    }
+}

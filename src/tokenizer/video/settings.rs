@@ -75,6 +75,17 @@ impl VideoSettings {
         if self.channels == 0 || self.latent_channels == 0 || self.multipliers.contains(&0) {
             return wrong("`channels`, `latent_channels` and `multipliers` are at least 1".into());
         }
+        let multiplier = self.multipliers.iter().copied().max().unwrap_or(0);
+        for (name, size, most) in [
+            ("channels", self.channels, 1 << 16),
+            ("multipliers", multiplier, 1 << 8),
+            ("blocks", self.blocks, 1 << 8),
+            ("latent_channels", self.latent_channels, 1 << 16),
+        ] {
+            if size > most {
+                return wrong(format!("`{name}` is at most {most}, not {size}"));
+            }
+        }
         if self.multipliers.is_empty() || self.multipliers.len() > 8 {
             return wrong("`multipliers` has one to eight levels".to_owned());
         }

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use super::{Network, VideoSettings, VideoTokenizer};
-use crate::engine::{Compute, HostTensor, Initialise, Parameters, Values, Weights};
+use crate::engine::{Compute, EngineError, HostTensor, Initialise, Parameters, Values, Weights};
 use crate::tokenizer::normaliser::Normaliser;
 use crate::tokenizer::trained::{DEVIATION, FILE, MEAN};
 use crate::tokenizer::{Tokenizer, TokenizerError};
@@ -79,10 +79,12 @@ impl VideoTokenizer {
         let clip: [usize; 3] = serde_json::from_str(text("clip")?)
             .map_err(|error| wrong("clip", error.to_string()))?;
         let statistics = [MEAN, DEVIATION].map(|name| weights.tensors.remove(name));
+        let unfit = |error: EngineError| wrong("weights", error.to_string());
+        Network::new(&Initialise::planned(compute), &settings)?
+            .check_shapes(&weights)
+            .map_err(unfit)?;
         let mut network = Network::new(&Initialise::to_load(compute), &settings)?;
-        network
-            .load(&weights)
-            .map_err(|error| wrong("weights", error.to_string()))?;
+        network.load(&weights).map_err(unfit)?;
         let mut tokenizer = Self::new(&modality, clip, network, compute)?;
         match statistics {
             [None, None] => {}
@@ -116,23 +118,14 @@ impl VideoTokenizer {
 
 #[cfg(test)]
 mod tests {
+    use super::super::testing::small;
     use super::*;
     use crate::clip::Signal;
     use ndarray::{ArrayD, IxDyn};
 
     #[test]
     fn a_stored_tokenizer_gives_the_same_tokens() {
-        let settings = VideoSettings {
-            channels: 4,
-            multipliers: vec![1, 2],
-            blocks: 1,
-            latent_channels: 4,
-            levels: vec![4, 3],
-            ..VideoSettings::default()
-        };
-        let compute = Compute::cpu();
-        let network = Network::new(&Initialise::new(&compute, 2), &settings).unwrap();
-        let mut one = VideoTokenizer::new("rgb", [4, 16, 16], network, &compute).unwrap();
+        let mut one = small([4, 16, 16], [4, 4], &[4, 3], 2);
         let values = ArrayD::from_shape_fn(IxDyn(&[4, 16, 16, 3]), |at| {
             ((at[0] * 7 + at[1] * 3 + at[2]) as f32 * 0.1).sin()
         });
@@ -153,9 +146,20 @@ mod tests {
             assert_eq!(again, tokens);
             assert_eq!(other.decode(&tokens).unwrap(), one.decode(&tokens).unwrap());
         }
+        // More memory than any machine has, or more blocks than can be named: refused before anything is allocated.
+        for change in [
+            |settings: &mut VideoSettings| settings.channels = 1 << 16,
+            |settings: &mut VideoSettings| settings.blocks = 1 << 40,
+        ] {
+            let mut settings = one.settings().clone();
+            change(&mut settings);
+            let mut huge = one.weights();
+            huge.metadata = VideoTokenizer::describe("rgb", one.clip(), &settings);
+            assert!(VideoTokenizer::from_weights(huge, &Compute::cpu()).is_err());
+        }
         let mut torn = one.weights();
         torn.tensors.remove(MEAN);
-        let error = VideoTokenizer::from_weights(torn, &compute).unwrap_err();
+        let error = VideoTokenizer::from_weights(torn, &Compute::cpu()).unwrap_err();
         assert!(error.to_string().contains("statistics"), "{error}");
     }
 }

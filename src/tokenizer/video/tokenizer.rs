@@ -12,7 +12,7 @@ use super::{Fsq, Network, VideoSettings, haar};
 use crate::clip::Signal;
 use crate::engine::parameters::to_host;
 use crate::tokenizer::normaliser::Normaliser;
-use crate::tokenizer::{TokenGrid, Tokenizer, TokenizerError};
+use crate::tokenizer::{TokenGrid, Tokenizer, TokenizerError, check_tokens};
 
 /// A network with the modality and clip size it works on. Signals are `[frames, height, width, 3]` in [-1, 1].
 #[derive(Debug, Clone)]
@@ -30,7 +30,7 @@ pub struct VideoTokenizer {
 /// What one training forward pass gives.
 #[derive(Debug)]
 pub struct Trained {
-    /// Mean squared error of all pixels, `[1]`: what to minimise.
+    /// Mean squared error of all pixels of the padded clip, `[1]`: what to minimise.
     pub loss: Tensor<1>,
     /// How far the latents are from those that use all codes evenly, `[1]`.
     pub unevenness: Tensor<1>,
@@ -148,7 +148,7 @@ impl VideoTokenizer {
         let mut values = Vec::new();
         for clip in clips {
             let padded = self.padding.pad(clip, COLOURS);
-            values.extend(haar::cut(&padded, self.size(), self.settings().patch));
+            values.extend(haar::cut(&padded, self.size(), [self.settings().patch; 2]));
         }
         let side = self.settings().coefficients();
         let rows = values.len() / side;
@@ -229,7 +229,8 @@ impl VideoTokenizer {
         (z + part(2)).tanh() * part(0) - part(1)
     }
 
-    /// 1 where a value of a block stands for a pixel, 0 where it repeats the first frame.
+    /// 1 where a value of a block stands for a pixel of the padded clip, 0 where it repeats the padded clip's first frame.
+    /// Padding counts: edge frames in front and at the end, zeros at the sides.
     fn kept(&self, samples: usize) -> Tensor<2> {
         let extent = self.extent(samples);
         let (patch, side) = (self.settings().patch, self.settings().coefficients());
@@ -322,26 +323,7 @@ impl Tokenizer for VideoTokenizer {
     }
 
     fn decode(&self, tokens: &[TokenGrid]) -> Result<Vec<Signal>, TokenizerError> {
-        let vocabulary = self.vocabulary();
-        for (index, grid) in tokens.iter().enumerate() {
-            let count: usize = self.grid.iter().product();
-            if grid.grid != self.grid || grid.ids.len() != count {
-                return Err(TokenizerError::Shape {
-                    modality: self.modality.clone(),
-                    index,
-                    found: grid.grid.clone(),
-                    expected: self.grid.clone(),
-                });
-            }
-            if let Some(token) = grid.ids.iter().find(|id| **id as usize >= vocabulary) {
-                return Err(TokenizerError::Vocabulary {
-                    modality: self.modality.clone(),
-                    index,
-                    token: *token,
-                    vocabulary,
-                });
-            }
-        }
+        check_tokens(self, tokens)?;
         let device = self.device();
         tokens
             .iter()
@@ -350,7 +332,7 @@ impl Tokenizer for VideoTokenizer {
                 let shape = [grid.ids.len(), self.fsq.width()];
                 let codes = Tensor::from_data(TensorData::new(codes, shape), &device);
                 let blocks = to_host(self.pixels(codes, 1));
-                let padded = haar::paste(&blocks, self.size(), self.settings().patch);
+                let padded = haar::paste(&blocks, self.size(), [self.settings().patch; 2]);
                 let mut values = self.padding.crop(&padded, COLOURS);
                 for value in &mut values {
                     *value = value.clamp(-1.0, 1.0);
@@ -385,22 +367,13 @@ pub fn psnr(found: &[f32], expected: &[f32]) -> f64 {
 
 #[cfg(test)]
 mod tests {
+    use super::super::testing::small;
     use super::*;
-    use crate::engine::{Compute, Gradients, Initialise, Parameters};
+    use crate::engine::{Gradients, Parameters};
     use crate::training::{AdamW, AdamWSettings};
 
     fn tiny(seed: u64) -> VideoTokenizer {
-        let settings = VideoSettings {
-            channels: 8,
-            multipliers: vec![1, 2],
-            blocks: 1,
-            latent_channels: 6,
-            levels: vec![8, 5, 5],
-            ..VideoSettings::default()
-        };
-        let compute = Compute::cpu();
-        let network = Network::new(&Initialise::new(&compute, seed), &settings).unwrap();
-        VideoTokenizer::new("rgb", [8, 16, 24], network, &compute).unwrap()
+        small([8, 16, 24], [8, 6], &[8, 5, 5], seed)
     }
 
     /// A bright square that moves over a gradient.

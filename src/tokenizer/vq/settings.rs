@@ -101,6 +101,17 @@ impl VqSettings {
         if self.codebook == 0 || self.code_width == 0 || self.depth == 0 || self.mlp_ratio == 0 {
             return wrong("codebook, code_width, depth and mlp_ratio are at least 1".to_owned());
         }
+        for (name, size, most) in [
+            ("codebook", self.codebook, 1 << 24),
+            ("code_width", self.code_width, 1 << 16),
+            ("width", self.width, 1 << 16),
+            ("depth", self.depth, 1 << 10),
+            ("mlp_ratio", self.mlp_ratio, 1 << 8),
+        ] {
+            if size > most {
+                return wrong(format!("{name} is at most {most}, not {size}"));
+            }
+        }
         if !(0.0..1.0).contains(&self.ema_decay)
             || self.dead_below < 0.0
             || self.commitment < 0.0

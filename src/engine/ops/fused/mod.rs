@@ -6,8 +6,10 @@
 
 mod activation;
 mod attention;
+mod convolution;
 mod cross_entropy;
 mod flat;
+mod frame_norm;
 mod layer_norm;
 mod linear;
 
@@ -24,7 +26,7 @@ use burn_flex::FlexTensor;
 pub use flat::{adamw, sum_of_squares};
 
 use super::super::Segments;
-use super::vector;
+use super::{Taps, vector};
 
 /// An array on the host: dense, row-major, f32.
 #[derive(Debug, Clone)]
@@ -92,6 +94,8 @@ pub enum Fused {
     SwiGlu,
     CrossEntropy { targets: Arc<[u32]> },
     TiedCrossEntropy { targets: Arc<[u32]> },
+    Convolution { taps: Taps },
+    FrameNorm { frames: usize, silu: bool },
 }
 
 impl Fused {
@@ -107,6 +111,11 @@ impl Fused {
             Self::SwiGlu => run(&activation::SwiGlu),
             Self::CrossEntropy { targets } => run(&cross_entropy::CrossEntropy { targets }),
             Self::TiedCrossEntropy { targets } => run(&cross_entropy::TiedCrossEntropy { targets }),
+            Self::Convolution { taps } => run(&convolution::Convolution { taps: *taps }),
+            Self::FrameNorm { frames, silu } => run(&frame_norm::FrameNorm {
+                frames: *frames,
+                silu: *silu,
+            }),
         }
     }
 }
@@ -276,7 +285,104 @@ mod tests {
         x.unsqueeze()
     }
 
+    /// Taps with several blocks of rows and several units, and with a stride.
+    const TAPS: [Taps; 4] = [
+        Taps::Space {
+            frames: 3,
+            height: 13,
+            width: 14,
+            stride: 1,
+        },
+        Taps::Space {
+            frames: 3,
+            height: 4,
+            width: 6,
+            stride: 2,
+        },
+        Taps::Time {
+            samples: 1,
+            frames: 3,
+            pixels: 260,
+            stride: 1,
+        },
+        Taps::Time {
+            samples: 2,
+            frames: 6,
+            pixels: 5,
+            stride: 2,
+        },
+    ];
+
+    type Convolve = fn(Tensor<2>, Tensor<2>, Tensor<1>, Taps) -> Tensor<2>;
+
+    fn convolved(x: &[Tensor<2>], convolve: Convolve, taps: Taps) -> Tensor<2> {
+        convolve(x[0].clone(), x[1].clone(), flat(&x[2]), taps)
+    }
+
+    fn video(taps: Taps) -> Vec<Tensor<2>> {
+        vec![
+            wave([taps.rows_in(), 3], 0.0),
+            wave([5, 3 * taps.count()], 1.0),
+            wave([1, 5], 2.0),
+        ]
+    }
+
+    fn video_cases() -> Vec<Case> {
+        vec![
+            (
+                "convolution in space",
+                video(TAPS[0]),
+                |x| convolved(x, ops::convolve, TAPS[0]),
+                |x| convolved(x, composed::convolve, TAPS[0]),
+            ),
+            (
+                "convolution in space with a stride",
+                video(TAPS[1]),
+                |x| convolved(x, ops::convolve, TAPS[1]),
+                |x| convolved(x, composed::convolve, TAPS[1]),
+            ),
+            (
+                "convolution in time",
+                video(TAPS[2]),
+                |x| convolved(x, ops::convolve, TAPS[2]),
+                |x| convolved(x, composed::convolve, TAPS[2]),
+            ),
+            (
+                "convolution in time with a stride",
+                video(TAPS[3]),
+                |x| convolved(x, ops::convolve, TAPS[3]),
+                |x| convolved(x, composed::convolve, TAPS[3]),
+            ),
+            (
+                "frame norm",
+                vec![
+                    wave([280, 20], 0.0) + 0.3,
+                    wave([1, 20], 1.0),
+                    wave([1, 20], 2.0),
+                ],
+                |x| ops::frame_norm(x[0].clone(), flat(&x[1]), flat(&x[2]), 2, false),
+                |x| composed::frame_norm(x[0].clone(), flat(&x[1]), flat(&x[2]), 2, false),
+            ),
+            (
+                "frame norm with SiLU",
+                vec![
+                    wave([280, 20], 0.0) + 0.3,
+                    wave([1, 20], 1.0),
+                    wave([1, 20], 2.0),
+                ],
+                |x| ops::frame_norm(x[0].clone(), flat(&x[1]), flat(&x[2]), 2, true),
+                |x| composed::frame_norm(x[0].clone(), flat(&x[1]), flat(&x[2]), 2, true),
+            ),
+        ]
+    }
+
     fn cases() -> Vec<Case> {
+        let mut cases = token_cases();
+        cases.extend(video_cases());
+        cases
+    }
+
+    fn token_cases() -> Vec<Case> {
         vec![
             (
                 "linear",
