@@ -1,4 +1,4 @@
-//! From logits to a token: top-k, then nucleus (top-p), then temperature, then the draw (model reference 7.4).
+//! From logits to a token: top-k, then nucleus (top-p), then temperature, then the draw.
 //!
 //! The order matters: the filters see the untempered logits. A temperature of 0 takes the largest logit without any filter.
 

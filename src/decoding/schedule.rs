@@ -1,4 +1,4 @@
-//! How many tokens each step decides, and at which temperature (Supp. C, model reference 7.1 and 7.5).
+//! How many tokens each step decides, and at which temperature (Supp. C).
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -81,8 +81,10 @@ pub enum TemperatureSchedule {
     /// From the temperature towards `min`, as a power of one over the step and with the share that is still open.
     Onex {
         /// The last step's temperature.
+        #[schemars(range(min = 0.0))]
         min: f64,
         /// The power of one over x.
+        #[schemars(extend("exclusiveMinimum" = 0.0))]
         power: f64,
     },
 }

@@ -85,11 +85,13 @@ pub struct TargetChanges {
     pub scheme: Option<Scheme>,
     /// Decoding steps.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(range(min = 1))]
     pub steps: Option<usize>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub schedule: Option<TokenSchedule>,
     /// 0 takes the most likely token.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(range(min = 0.0))]
     pub temperature: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub temperature_schedule: Option<TemperatureSchedule>,
@@ -98,6 +100,7 @@ pub struct TargetChanges {
     pub guidance: Option<f64>,
     /// Mass of the nucleus; 0 is off.
     #[serde(skip_serializing_if = "Option::is_none")]
+    #[schemars(range(min = 0.0, max = 1.0))]
     pub top_p: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
     pub top_k: Option<TopK>,
@@ -173,5 +176,44 @@ impl DecodingSettings {
             top_k: changes.top_k.unwrap_or(all.top_k),
             draw: changes.draw.unwrap_or(all.draw),
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The bounds of a property in a schema.
+    fn bounds(schema: &serde_json::Value, name: &str) -> [Option<f64>; 3] {
+        let property = &schema["properties"][name];
+        ["minimum", "maximum", "exclusiveMinimum"].map(|bound| property[bound].as_f64())
+    }
+
+    #[test]
+    fn changes_for_one_target_have_the_bounds_of_the_settings_for_all() {
+        let all = serde_json::to_value(schemars::schema_for!(TargetSettings)).unwrap();
+        let changes = serde_json::to_value(schemars::schema_for!(TargetChanges)).unwrap();
+        for name in ["steps", "temperature", "top_p"] {
+            let own = bounds(&changes, name);
+            assert!(own[0].is_some(), "{name}");
+            assert_eq!(own, bounds(&all, name), "{name}");
+        }
+    }
+
+    #[test]
+    fn a_power_that_gives_no_temperature_is_out_of_bounds() {
+        let schedule = serde_json::to_value(schemars::schema_for!(TemperatureSchedule)).unwrap();
+        let variants = schedule["oneOf"].as_array().unwrap();
+        let onex = variants.iter().find_map(|variant| {
+            let onex = &variant["properties"]["onex"];
+            onex.is_object().then_some(onex)
+        });
+        assert_eq!(bounds(onex.unwrap(), "power"), [None, None, Some(0.0)]);
+        let onex = TemperatureSchedule::Onex {
+            min: 0.1,
+            power: 0.0,
+        };
+        let values = onex.values(1.0, &[1, 1]);
+        assert!(values.iter().any(|v| v.is_nan()), "{values:?}");
     }
 }

@@ -263,16 +263,30 @@ fn common_clips(first: &Entrant, entrants: &[Entrant]) -> Result<Vec<String>, Co
     Ok(common)
 }
 
+/// Which intervals the table prints, in words.
+fn intervals(settings: &IntervalSettings) -> String {
+    // Three digits, so that neither 0.999 becomes 100 % nor 0.55 shows how floats are stored.
+    let percent = (1e5 * settings.level).round() / 1e3;
+    let over = |what| settings.over.contains(&what);
+    let how = match (over(Over::Clips), over(Over::Seeds)) {
+        (true, true) => "bootstrap over clips, Student's t over seeds, the wider of the two",
+        (true, false) => "bootstrap over clips",
+        (false, true) => "Student's t over seeds",
+        (false, false) => return "no intervals".to_owned(),
+    };
+    format!("[{percent} % interval]: {how}")
+}
+
 fn notes(
     entrants: &[Entrant],
     settings: &CompareSettings,
     common: &[String],
     published: Option<&Published>,
 ) -> Vec<String> {
-    let percent = 100.0 * settings.interval.level;
     let mut notes = vec![format!(
-        "{} common clips; [{percent:.0} % interval]: bootstrap over clips, Student's t over seeds, the wider of the two",
-        common.len()
+        "{} common clips; {}",
+        common.len(),
+        intervals(&settings.interval)
     )];
     if let Some(baseline) = &settings.baseline {
         notes.push(format!(
@@ -305,7 +319,7 @@ fn notes(
 mod tests {
     use super::*;
     use crate::evaluation::outcome::Outcome;
-    use crate::evaluation::scores::{ColumnScores, FORMAT, ScoreSet};
+    use crate::evaluation::scores::{ColumnScores, FORMAT, ScoreSet, SetScore};
     use rand::RngExt;
     use std::collections::BTreeMap;
 
@@ -360,6 +374,63 @@ mod tests {
         assert!(difference.interval.unwrap().contains(5.0) && difference.p_holm.unwrap() < 0.01);
         assert!(!table.rows[0].cells[0].bold, "the intervals overlap");
         assert_eq!(table.rows[0].cells[0].n, 50, "only common clips count");
+    }
+
+    #[test]
+    fn the_note_says_which_intervals_are_printed() {
+        let note = |level, over: &[Over]| {
+            intervals(&IntervalSettings {
+                level,
+                over: over.to_vec(),
+                ..IntervalSettings::default()
+            })
+        };
+        assert_eq!(
+            note(0.95, &[Over::Seeds, Over::Clips]),
+            "[95 % interval]: bootstrap over clips, Student's t over seeds, the wider of the two"
+        );
+        assert_eq!(
+            note(0.999, &[Over::Clips]),
+            "[99.9 % interval]: bootstrap over clips"
+        );
+        assert_eq!(
+            note(0.55, &[Over::Seeds]),
+            "[55 % interval]: Student's t over seeds"
+        );
+        assert_eq!(note(0.9, &[]), "no intervals");
+    }
+
+    #[test]
+    fn a_number_of_a_whole_set_is_shown_only_on_the_clips_that_are_common() {
+        let entrant = |label: &str, clips: usize| {
+            let mut own = scores(1, 0..clips, 0.0);
+            own.own.sets.push(SetScore {
+                column: Column::named("body.kin_fid").unwrap(),
+                value: Some(0.5),
+                n: clips,
+                dim: 2,
+                floor: None,
+                unavailable: None,
+            });
+            Entrant {
+                label: label.into(),
+                seeds: vec![own],
+            }
+        };
+        let cells = |entrants: &[Entrant]| -> Vec<(Option<f64>, Option<String>)> {
+            let table = compare("", entrants, &CompareSettings::default(), None).unwrap();
+            let cells = table.rows.into_iter().map(|row| row.cells[1].clone());
+            cells.map(|cell| (cell.value, cell.reason)).collect()
+        };
+        let (whole, none) = ((Some(0.5), None), "of more clips than the common ones");
+        assert_eq!(
+            cells(&[entrant("a", 9), entrant("b", 9)]),
+            [whole.clone(), whole.clone()]
+        );
+        assert_eq!(
+            cells(&[entrant("a", 9), entrant("b", 12)]),
+            [whole, (None, Some(none.to_owned()))]
+        );
     }
 
     #[test]

@@ -262,23 +262,20 @@ fn collect<'a>(
     for (position, column) in columns.iter().enumerate() {
         match column.name.as_str() {
             "body.kin_fid" => {
-                if let Some(kin) = &kin {
-                    set.sets.push(SetScore {
-                        column: column.clone(),
-                        value: kin.kin_fid,
-                        n: kin.n,
-                        dim: kin.dim,
-                        floor: kin.floor,
-                        unavailable: kin
-                            .kin_fid
-                            .is_none()
-                            .then(|| "needs at least two clips".to_owned()),
-                    });
-                }
+                let found = kin.as_ref().ok();
+                set.sets.push(SetScore {
+                    column: column.clone(),
+                    value: found.and_then(|kin| kin.kin_fid),
+                    n: found.map_or(0, |kin| kin.n),
+                    dim: found.map_or(0, |kin| kin.dim),
+                    floor: found.and_then(|kin| kin.floor),
+                    unavailable: kin.as_ref().err().cloned(),
+                });
             }
             "body.kin_cos" => {
                 let mut cosines = kin
                     .as_ref()
+                    .ok()
                     .map(|k| k.cosines.as_slice())
                     .unwrap_or_default()
                     .iter();
@@ -304,13 +301,17 @@ fn collect<'a>(
     set
 }
 
-/// Scores over the clips that have descriptors. `None` without any, and where a clip has no direction (it sits at the mean).
-fn kinematics(described: &[Option<&(Array1<f64>, Array1<f64>)>]) -> Option<KinScores> {
+/// Scores over the clips that have descriptors, or why there are none: fewer than two, or a clip without a direction (it sits
+/// at the mean).
+fn kinematics(described: &[Option<&(Array1<f64>, Array1<f64>)>]) -> Result<KinScores, String> {
     let pairs: Vec<_> = described.iter().flatten().collect();
-    let stack = |views: Vec<_>| ndarray::stack(Axis(0), &views).ok();
+    if pairs.len() < 2 {
+        return Err("needs two clips with every joint valid".to_owned());
+    }
+    let stack = |views: Vec<_>| ndarray::stack(Axis(0), &views).map_err(|error| error.to_string());
     let predicted = stack(pairs.iter().map(|p| p.0.view()).collect())?;
     let truth = stack(pairs.iter().map(|p| p.1.view()).collect())?;
-    kin_scores(predicted.view(), truth.view()).ok()
+    kin_scores(predicted.view(), truth.view()).map_err(|refusal| refusal.to_string())
 }
 
 fn embedding_scores(
@@ -361,11 +362,13 @@ mod tests {
     use ndarray::Array3;
     use rand::RngExt;
 
-    /// Ten walking clips and a system that adds `noise` to the truth, except where `predicted` says it did nothing.
+    /// Ten walking clips and a system that adds `noise` to the truth, except where `predicted` says it did nothing. `joint` says
+    /// whether a clip's first joint is valid.
     struct Walks {
         ids: Vec<String>,
         noise: f64,
         predicted: fn(usize) -> bool,
+        joint: fn(usize) -> bool,
     }
 
     fn walks(noise: f64) -> Walks {
@@ -373,6 +376,7 @@ mod tests {
             ids: (0..10).map(|i| format!("walk/{i}")).collect(),
             noise,
             predicted: |_| true,
+            joint: |_| true,
         }
     }
 
@@ -402,7 +406,7 @@ mod tests {
             clip.body = Some(JointTrack {
                 rate: 30.0,
                 joints: Array3::from_shape_fn((60, 21, 3), |_| next() as f32),
-                valid: Array2::from_elem((60, 21), true),
+                valid: Array2::from_shape_fn((60, 21), |at| at != (0, 0) || (self.joint)(index)),
             });
             clip.gaze = Some(GazeTrack {
                 rate: 30.0,
@@ -497,6 +501,25 @@ mod tests {
             scores(&none),
             Err(EvaluationError::NoOverlap { truth: 10, .. })
         ));
+    }
+
+    #[test]
+    fn a_column_that_needs_whole_bodies_says_so_where_there_are_none() {
+        let reason = |joint| {
+            let walks = Walks {
+                joint,
+                ..walks(0.1)
+            };
+            let scores = scores(&walks).unwrap();
+            let fid = scores.own.set("body.kin_fid").unwrap().clone();
+            assert_eq!(fid.value.is_none(), fid.unavailable.is_some());
+            assert!(!scores.baselines.contains_key(FLOOR));
+            fid.unavailable
+        };
+        let needs = Some("needs two clips with every joint valid".to_owned());
+        assert_eq!(reason(|_| false), needs);
+        assert_eq!(reason(|index| index == 3), needs);
+        assert_eq!(reason(|index| index < 4), None);
     }
 
     #[test]

@@ -92,10 +92,19 @@ fn text(row: &Row, cell: &Cell, strong: impl Fn(&str) -> String) -> String {
             number(difference.mean)
         );
         if let Some(p) = difference.p_holm {
-            let _ = write!(text, " p={p:.2}");
+            text.push_str(&probability(p));
         }
     }
     qualified(text, cell)
+}
+
+/// ` p=0.04`; no p-value of a bootstrap is 0, and none is printed as 0.
+fn probability(p: f64) -> String {
+    if p < 0.01 {
+        " p<0.01".to_owned()
+    } else {
+        format!(" p={p:.2}")
+    }
 }
 
 fn qualified(mut text: String, cell: &Cell) -> String {
@@ -267,6 +276,8 @@ fn latex(table: &Table) -> String {
                 }
                 '~' => out.push_str("\\textasciitilde{}"),
                 '^' => out.push_str("\\textasciicircum{}"),
+                '<' => out.push_str("$<$"),
+                '>' => out.push_str("$>$"),
                 '↓' => out.push_str("$\\downarrow$"),
                 '↑' => out.push_str("$\\uparrow$"),
                 other => out.push(other),
@@ -477,6 +488,15 @@ mod tests {
         mean pose,baseline,body.ga_mpjpe,mm,lower,200,191,209,clips,40,1,0,0,,,,,,false,
         one clip,system,body.ga_mpjpe,mm,lower,300,,,,1,1,0,0,,,,,,false,
         "#);
+    }
+
+    #[test]
+    fn small_probabilities_are_not_printed_as_zero() {
+        let shown = [0.0005, 0.0099, 0.01, 0.042, 1.0].map(probability);
+        assert_eq!(
+            shown,
+            [" p<0.01", " p<0.01", " p=0.01", " p=0.04", " p=1.00"]
+        );
     }
 
     #[test]

@@ -118,6 +118,16 @@ pub(crate) fn score_clip(
     };
     let rgb = Outcome::of(rgb.and_then(|(truth, prediction)| psnr(truth, prediction)));
 
+    // Compat counts a hand without a visible frame as 0.0; one that is visible and was not predicted is no such hand.
+    let lacks_hand = [
+        (&truth.left_hand, &prediction.left_hand),
+        (&truth.right_hand, &prediction.right_hand),
+    ]
+    .into_iter()
+    .any(|(truth, prediction)| {
+        let visible = truth.as_ref().is_some_and(|t| t.valid.iter().any(|v| *v));
+        visible && prediction.is_none()
+    });
     score.values = columns
         .iter()
         .map(|column| {
@@ -132,6 +142,7 @@ pub(crate) fn score_clip(
                 "right_hand" => right
                     .as_ref()
                     .map_or(Outcome::Null, |e| joint_outcome(e, metric)),
+                "hands" if metric.ends_with("@compat") && lacks_hand => Outcome::Null,
                 "hands" => hands_outcome(&left, &right, metric),
                 "camera" => camera.as_ref().map_or(Outcome::Null, |e| e.outcome(metric)),
                 "gaze" => gaze
@@ -227,7 +238,8 @@ impl CameraScore {
                 .map(|i| {
                     let position = (i as f64 / truth.rate * prediction.rate).min(last as f64);
                     let below = position.floor() as usize;
-                    let above = (below + 1).min(last);
+                    // A pose that is hit exactly does not depend on the next one.
+                    let above = (below + usize::from(position.fract() > 0.0)).min(last);
                     rigid::interpolate(&guess[below], &guess[above], position.fract())
                 })
                 .collect();
@@ -414,4 +426,86 @@ fn declared_rmse(truth: &Signal, prediction: &Signal) -> Result<Option<f64>, Ref
         count += 1;
     }
     Ok((count > 0).then(|| (sum / count as f64).sqrt()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use ndarray::Array2;
+
+    fn clip(poses: usize, rate: f64) -> Clip {
+        let mut clip = Clip::empty("a", "test");
+        let pose = |i: usize| {
+            let t = i as f64 / rate;
+            rigid::Rigid::translation(t, (7.0 * t).sin(), (3.0 * t).cos())
+        };
+        clip.camera = Some(CameraTrack {
+            rate,
+            T_world_camera: (0..poses).map(pose).collect(),
+            valid: vec![true; poses],
+            up_world: None,
+            intrinsics: None,
+        });
+        clip
+    }
+
+    fn lose(clip: &mut Clip, index: usize) {
+        let lost = rigid::Rigid::translation(f64::NAN, f64::NAN, f64::NAN);
+        clip.camera.as_mut().unwrap().T_world_camera[index] = lost;
+    }
+
+    #[test]
+    fn a_lost_pose_is_ignored_where_nothing_is_scored_and_refused_where_something_is() {
+        let columns = ["camera.ate", "camera.rre", "camera.position"];
+        let columns = columns.map(|name| Column::named(name).unwrap());
+        let mut truth = clip(60, 30.0);
+        truth.camera.as_mut().unwrap().valid[20] = false;
+        let score = |truth: &Clip, prediction: &Clip| score_clip(&columns, None, truth, prediction);
+        let mut prediction = clip(60, 30.0);
+        let whole = score(&truth, &prediction).unwrap().values;
+        lose(&mut prediction, 20);
+        assert_eq!(score(&truth, &prediction).unwrap().values, whole);
+        lose(&mut prediction, 31);
+        assert!(matches!(
+            score(&truth, &prediction),
+            Err(Refusal::NotFinite { .. })
+        ));
+        // At half the rate, pose 10 is needed for samples 19, 20 and 21.
+        let mut prediction = clip(30, 15.0);
+        lose(&mut prediction, 10);
+        assert!(score(&truth, &prediction).is_err());
+        truth.camera.as_mut().unwrap().valid[19..=21].fill(false);
+        let scored = score(&truth, &prediction).unwrap();
+        assert!(scored.resampled && scored.values.iter().all(|v| v.number().is_some()));
+    }
+
+    #[test]
+    fn compat_counts_a_hand_without_a_frame_as_zero_and_one_that_was_not_predicted_not_at_all() {
+        let columns = ["hands.ra_mpjpe", "hands.ra_mpjpe@compat"];
+        let columns = columns.map(|name| Column::named(name).unwrap());
+        let track = |at: f32, valid: bool| {
+            Some(JointTrack {
+                rate: 30.0,
+                joints: Array3::from_shape_fn(
+                    (4, 21, 3),
+                    |(_, j, _)| if j == 0 { 0.0 } else { at },
+                ),
+                valid: Array2::from_elem((4, 21), valid),
+            })
+        };
+        let values = |seen: bool, predicted: bool| {
+            let (mut truth, mut prediction) = (clip(4, 30.0), clip(4, 30.0));
+            (truth.left_hand, truth.right_hand) = (track(0.0, true), track(0.0, seen));
+            prediction.left_hand = track(0.1, true);
+            prediction.right_hand = track(0.1, true).filter(|_| predicted);
+            let found = score_clip(&columns, None, &truth, &prediction).unwrap();
+            [found.values[0].number(), found.values[1].number()]
+                .map(|value| value.map(|v| (v * 10.0).round() / 10.0))
+        };
+        // Twenty of 21 joints are off by 0.1 m along each axis.
+        assert_eq!(values(true, true), [Some(165.0), Some(165.0)]);
+        assert_eq!(values(false, true), [Some(165.0), Some(82.5)]);
+        assert_eq!(values(false, false), [Some(165.0), Some(82.5)]);
+        assert_eq!(values(true, false), [Some(165.0), None]);
+    }
 }

@@ -104,6 +104,14 @@ pub enum ScoresError {
 pub const FILE: &str = "scores.json";
 
 impl Scores {
+    /// Whether any of its own columns answers to one of `names`.
+    #[must_use]
+    pub fn has(&self, names: &[String]) -> bool {
+        let columns = self.own.columns.iter().map(|scores| &scores.column);
+        let mut all = columns.chain(self.own.sets.iter().map(|score| &score.column));
+        all.any(|column| names.iter().any(|name| column.answers_to(name)))
+    }
+
     /// Writes `scores.json` into `directory`.
     ///
     /// # Errors

@@ -16,6 +16,8 @@ pub(super) struct On<'a> {
     set: &'a ScoreSet,
     /// Position of every common clip in the set.
     order: Vec<usize>,
+    /// The set has clips that are not common.
+    is_larger: bool,
 }
 
 impl<'a> On<'a> {
@@ -29,6 +31,7 @@ impl<'a> On<'a> {
         Self {
             set,
             order: common.iter().map(|clip| position[clip]).collect(),
+            is_larger: scores.clips.len() > common.len(),
         }
     }
 
@@ -78,13 +81,20 @@ impl Side<'_> {
         }
     }
 
-    /// Set-wide numbers belong to the set they were computed on; only seeds can vary.
+    /// Set-wide numbers belong to the set they were computed on and are comparable only at equal n: a set that has more than
+    /// the common clips has none here. Only seeds can vary.
     fn set_cell(&self, column: &Column, settings: &IntervalSettings) -> Cell {
         let scores: Vec<_> = self
             .sets
             .iter()
             .filter_map(|s| s.set.set(&column.name))
             .collect();
+        if !scores.is_empty() && self.sets.iter().any(|s| s.is_larger) {
+            return Cell {
+                reason: Some("of more clips than the common ones".to_owned()),
+                ..Cell::default()
+            };
+        }
         let values: Vec<f64> = scores.iter().filter_map(|s| s.value).collect();
         let interval = settings
             .over

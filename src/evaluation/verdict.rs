@@ -39,7 +39,10 @@ fn sentence(table: &Table, row: &Row) -> Option<String> {
     }
     let parts: Vec<String> = [
         (beats, "beats every trivial baseline, intervals apart, on"),
-        (unclear, "is better, but intervals overlap, on"),
+        (
+            unclear,
+            "is better, but intervals overlap or are missing, on",
+        ),
         (loses, "does not beat them on"),
     ]
     .into_iter()
@@ -158,7 +161,7 @@ mod tests {
             against_trivial(&table),
             [
                 "full beats every trivial baseline, intervals apart, on body.ga_mpjpe, depth.delta@median; is better, but intervals \
-                 overlap, on gaze.mse (still); does not beat them on camera.rte (still)"
+                 overlap or are missing, on gaze.mse (still); does not beat them on camera.rte (still)"
             ]
         );
     }

@@ -71,7 +71,7 @@ impl Op for Evaluate {
     }
 
     fn version(&self) -> u32 {
-        2
+        3
     }
 
     fn about(&self) -> &'static str {
@@ -221,12 +221,7 @@ impl Op for Evaluate {
         let scores = match outcome {
             Ok(scores) => scores,
             Err(EvaluationError::Interrupted) => return Err(StageError::Interrupted),
-            Err(error) => {
-                return Err(input(
-                    &error.to_string(),
-                    "a refused prediction would look like a good score",
-                ));
-            }
+            Err(error) => return Err(input(&error.to_string(), &help(&error))),
         };
         scores.write(context.output()).map_err(StageError::other)?;
         let clips = scores.clips.len();
@@ -270,6 +265,21 @@ fn suite<'a>(
     suite
 }
 
+/// What to do about an evaluation that stopped.
+fn help(error: &EvaluationError) -> String {
+    match error {
+        EvaluationError::Metric(error) => format!("there are: {}", error.known.join(" ")),
+        EvaluationError::Load { .. } => {
+            "bring the file back, or run the stage that makes it again".to_owned()
+        }
+        EvaluationError::NoOverlap { .. } => {
+            "clips are matched by id: the path of a file below its folder, without `.npz`"
+                .to_owned()
+        }
+        _ => "left out, a refused prediction would look like a good score".to_owned(),
+    }
+}
+
 fn input(message: &str, help: &str) -> StageError {
     StageError::Input {
         code: Code::E0601,
@@ -311,4 +321,29 @@ pub(super) fn write_text(root: &Path, name: &str, text: &str) -> Result<(), Stag
         std::fs::create_dir_all(folder).map_err(StageError::io(folder))?;
     }
     std::fs::write(&path, text).map_err(StageError::io(&path))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::evaluation::outcome::Refusal;
+
+    #[test]
+    fn the_help_fits_the_reason() {
+        let refused = EvaluationError::Refused {
+            clip: "a".to_owned(),
+            refusal: Refusal::ZeroEmbedding { row: 0 },
+        };
+        let damaged = EvaluationError::Load {
+            clip: "a".to_owned(),
+            error: "cut short".into(),
+        };
+        let apart = EvaluationError::NoOverlap {
+            truth: 3,
+            example: "a".to_owned(),
+        };
+        assert!(help(&refused).contains("refused"));
+        assert!(help(&damaged).contains("again"));
+        assert!(help(&apart).contains("matched by id"));
+    }
 }

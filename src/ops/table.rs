@@ -42,7 +42,7 @@ impl Op for TableOp {
     }
 
     fn version(&self) -> u32 {
-        3
+        4
     }
 
     fn about(&self) -> &'static str {
@@ -98,22 +98,28 @@ impl Op for TableOp {
         settings: &TableSettings,
         context: &mut dyn StageContext,
     ) -> Result<Value, StageError> {
-        let mut entrants: Vec<Entrant> = Vec::new();
-        for (position, artifact) in context.inputs("scores").iter().enumerate() {
-            let scores = Scores::read(&artifact.path).map_err(StageError::other)?;
-            let label = match settings.labels.get(position) {
-                Some(label) => label.clone(),
-                None if entrants.iter().any(|e| e.label == scores.system) => artifact.stage.clone(),
-                None => scores.system.clone(),
-            };
-            entrants.push(Entrant {
+        let artifacts = context.inputs("scores");
+        let scores = artifacts
+            .iter()
+            .map(|artifact| Scores::read(&artifact.path))
+            .collect::<Result<Vec<_>, _>>()
+            .map_err(StageError::other)?;
+        let stages: Vec<&str> = artifacts.iter().map(|a| a.stage.as_str()).collect();
+        let systems: Vec<&str> = scores.iter().map(|s| s.system.as_str()).collect();
+        let labels = labels(&settings.labels, &stages, &systems);
+        let mut how = settings.compare.clone();
+        how.baseline = how.baseline.map(|name| row(name, &labels, &stages));
+        let entrants: Vec<Entrant> = labels
+            .into_iter()
+            .zip(scores)
+            .map(|(label, scores)| Entrant {
                 label,
                 seeds: vec![scores],
-            });
-        }
+            })
+            .collect();
         let published = settings.published.as_ref().map(|entry| &entry.settings);
-        let table = compare(&settings.title, &entrants, &settings.compare, published)
-            .map_err(StageError::other)?;
+        let table =
+            compare(&settings.title, &entrants, &how, published).map_err(StageError::other)?;
         let output = context.output();
         let json = serde_json::to_string(&table).map_err(StageError::other)?;
         write_text(output, "table.json", &json)?;
@@ -124,5 +130,52 @@ impl Op for TableOp {
             write_text(output, "report/table_intervals.svg", &plot)?;
         }
         Ok(json!({"rows": table.rows.len(), "columns": table.columns.len()}))
+    }
+}
+
+/// The rows' labels: the chosen ones, else the names of the systems, or of the stages where two are the same.
+fn labels(chosen: &[String], stages: &[&str], systems: &[&str]) -> Vec<String> {
+    let own = |system: &str| systems.iter().filter(|s| **s == system).count() == 1;
+    stages
+        .iter()
+        .zip(systems)
+        .enumerate()
+        .map(|(position, (stage, system))| match chosen.get(position) {
+            Some(label) => label.clone(),
+            None if own(system) => (*system).to_owned(),
+            None => (*stage).to_owned(),
+        })
+        .collect()
+}
+
+/// The label that `name` means: a label itself, or the stage of a row.
+fn row(name: String, labels: &[String], stages: &[&str]) -> String {
+    if labels.contains(&name) {
+        return name;
+    }
+    let position = stages.iter().position(|stage| *stage == name);
+    position.map_or(name, |position| labels[position].clone())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rows_are_named_after_their_stages_where_two_systems_are_the_same() {
+        let stages = ["full", "theirs", "small"];
+        let named = labels(&[], &stages, &["reviv", "EgoAllo", "reviv"]);
+        assert_eq!(named, ["full", "EgoAllo", "small"]);
+        let chosen = ["a", "b", "c"].map(str::to_owned);
+        assert_eq!(labels(&chosen, &stages, &["reviv"; 3]), chosen);
+    }
+
+    #[test]
+    fn a_baseline_is_a_label_or_a_stage() {
+        let labels = ["reviv", "EgoAllo"].map(str::to_owned);
+        let means = |name: &str| row(name.to_owned(), &labels, &["scores", "theirs"]);
+        assert_eq!(means("EgoAllo"), "EgoAllo");
+        assert_eq!(means("scores"), "reviv");
+        assert_eq!(means("nobody"), "nobody");
     }
 }

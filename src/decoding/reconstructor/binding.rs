@@ -22,6 +22,15 @@ impl Binding {
     /// # Errors
     /// When a file cannot be read.
     pub fn of(folder: &Path, clips: ClipFormat) -> Result<Self, ReconstructorError> {
+        let tokenizers = Self::digests(folder)?;
+        Ok(Self { clips, tokenizers })
+    }
+
+    /// What [`Binding::tokenizers`] says of the tokenizers that lie in `folder`; nothing where there are none.
+    ///
+    /// # Errors
+    /// When a file cannot be read.
+    pub fn digests(folder: &Path) -> Result<BTreeMap<String, String>, ReconstructorError> {
         let root = folder.join(TOKENIZERS);
         let mut tokenizers = BTreeMap::new();
         for path in entries(&root)? {
@@ -31,7 +40,7 @@ impl Binding {
                 tokenizers.insert(name.to_owned(), digest(&path)?);
             }
         }
-        Ok(Self { clips, tokenizers })
+        Ok(tokenizers)
     }
 
     /// Writes [`FILE`] into `folder`.

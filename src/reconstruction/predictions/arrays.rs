@@ -184,7 +184,13 @@ fn expect_shape(name: &str, found: &[usize], expected: &[usize]) -> Result<(), S
     }
 }
 
-/// Poses out of `[T, 4, 4]` matrices (a block that is no rotation is refused) or `[T, 9]` vectors (made orthonormal).
+/// Stands for a pose that is not finite: scoring leaves it alone where nothing is scored, and refuses it where something is.
+fn no_pose() -> Isometry3<f64> {
+    Isometry3::translation(f64::NAN, f64::NAN, f64::NAN)
+}
+
+/// Poses out of `[T, 4, 4]` matrices (a block that is no rotation is refused) or `[T, 9]` vectors (made orthonormal). A pose
+/// with a value that is not finite becomes [`no_pose`].
 fn camera_poses(array: &NpyArray) -> Result<Vec<Isometry3<f64>>, String> {
     let name = "camera";
     if array.shape.len() == 2 {
@@ -194,6 +200,9 @@ fn camera_poses(array: &NpyArray) -> Result<Vec<Isometry3<f64>>, String> {
             .outer_iter()
             .enumerate()
             .map(|(i, row)| {
+                if !row.iter().all(|value| value.is_finite()) {
+                    return Ok(no_pose());
+                }
                 let six = [row[0], row[1], row[2], row[3], row[4], row[5]];
                 let turn = rotation::from_6d(&six).ok_or_else(|| {
                     format!("array `{name}`: the rotation of pose {i} has no direction")
@@ -209,6 +218,9 @@ fn camera_poses(array: &NpyArray) -> Result<Vec<Isometry3<f64>>, String> {
         .outer_iter()
         .enumerate()
         .map(|(i, matrix)| {
+            if !matrix.iter().all(|value| value.is_finite()) {
+                return Ok(no_pose());
+            }
             let mut flat = [0.0; 16];
             flat.iter_mut()
                 .zip(matrix)
@@ -222,4 +234,33 @@ fn camera_poses(array: &NpyArray) -> Result<Vec<Isometry3<f64>>, String> {
             rigid::from_row_major(&flat).map_err(|e| format!("array `{name}`: pose {i}: {e}"))
         })
         .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_pose_that_is_not_finite_has_no_place_and_the_others_stay() {
+        let mut matrices = Array3::<f64>::zeros((3, 4, 4));
+        for mut matrix in matrices.outer_iter_mut() {
+            matrix.diag_mut().fill(1.0);
+        }
+        matrices[(1, 0, 0)] = f64::NAN;
+        let nine = Array2::from_shape_fn((3, 9), |(i, c)| match (i, c) {
+            (1, 7) => f64::INFINITY,
+            (_, 0 | 4) => 1.0,
+            _ => 0.0,
+        });
+        for npz in [
+            Npz::default().with("camera", matrices),
+            Npz::default().with("cam", nine),
+        ] {
+            let clip = from_npz(&npz, "a", "", |_, rate| rate).unwrap();
+            let poses = clip.camera.unwrap().T_world_camera;
+            assert_eq!(poses[0], Isometry3::identity());
+            assert!(poses[1].translation.vector.iter().all(|v| v.is_nan()));
+            assert_eq!(poses[2], Isometry3::identity());
+        }
+    }
 }
