@@ -49,7 +49,7 @@ impl Op for Clips {
     }
 
     fn version(&self) -> u32 {
-        3
+        4
     }
 
     fn about(&self) -> &'static str {

@@ -24,6 +24,10 @@ use std::path::{Path, PathBuf};
 
 /// Clips tokenized at a time.
 const CHUNK: usize = 16;
+/// The folder of the checkpoints where shards lie until all are finished.
+const SHARDS: &str = "tokens";
+/// The folder of the checkpoints with an empty file for every finished shard, `{split}-{number}`.
+const MARKERS: &str = "tokens_done";
 
 /// Whether raw video travels with the tokens.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
@@ -241,15 +245,17 @@ impl Op for Tokenize {
             }
         }
         let total: usize = sets.iter().map(|(_, set)| set.len()).sum();
+        let markers = context.checkpoints().join(MARKERS);
+        std::fs::create_dir_all(&markers).map_err(StageError::io(&markers))?;
         let mut done = 0;
         let mut splits = serde_json::Map::new();
         for (split, set) in &sets {
-            let folder = context.checkpoints().join("tokens").join(split);
+            let folder = context.checkpoints().join(SHARDS).join(split);
             std::fs::create_dir_all(&folder).map_err(StageError::io(&folder))?;
             for start in (0..set.len()).step_by(TOKENS_PER_SHARD) {
                 let end = (start + TOKENS_PER_SHARD).min(set.len());
                 let number = (start / TOKENS_PER_SHARD) as u32;
-                let marker = folder.join(format!("shard-{number:06}.done"));
+                let marker = markers.join(format!("{split}-{number:06}"));
                 if !marker.exists() {
                     let mut shard = ShardWriter::new(&folder, number);
                     for from in (start..end).step_by(CHUNK) {
@@ -273,13 +279,8 @@ impl Op for Tokenize {
             }
             splits.insert((*split).to_owned(), json!({ "clips": set.len() }));
         }
-        for (split, _) in &sets {
-            let folder = context.checkpoints().join("tokens").join(split);
-            deliver(&folder, &context.output().join(split), true)?;
-        }
-        // The shards are gone from here: their markers must not outlive them.
-        let kept = context.checkpoints().join("tokens");
-        std::fs::remove_dir_all(&kept).map_err(StageError::io(&kept))?;
+        let names: Vec<&str> = sets.iter().map(|(split, _)| *split).collect();
+        deliver_splits(context.checkpoints(), &names, context.output())?;
         let mut contents = json!({ "tokens": tokens, "splits": splits, "format": format });
         if settings.pixels == RawVideo::Rgb {
             contents[PIXELS] = json!([format.frames, format.size, format.size, 3]);
@@ -342,7 +343,20 @@ fn add_pixels(
     Ok(())
 }
 
-/// Copies (or moves) a folder without what describes it as an artifact: its manifest, its page, and the markers of finished shards.
+/// Moves the finished shards of every split to where the artifact is written.
+///
+/// The markers go first: a marker that outlived its shard would make the next try publish an artifact without it.
+fn deliver_splits(checkpoints: &Path, splits: &[&str], output: &Path) -> Result<(), StageError> {
+    let markers = checkpoints.join(MARKERS);
+    std::fs::remove_dir_all(&markers).map_err(StageError::io(&markers))?;
+    let kept = checkpoints.join(SHARDS);
+    for split in splits {
+        deliver(&kept.join(split), &output.join(split), true)?;
+    }
+    std::fs::remove_dir_all(&kept).map_err(StageError::io(&kept))
+}
+
+/// Copies (or moves) a folder without what describes it as an artifact: its manifest, its page, and unfinished shards.
 fn deliver(from: &Path, to: &Path, moves: bool) -> Result<(), StageError> {
     std::fs::create_dir_all(to).map_err(StageError::io(to))?;
     let mut paths: Vec<PathBuf> = Vec::new();
@@ -365,4 +379,29 @@ fn deliver(from: &Path, to: &Path, moves: bool) -> Result<(), StageError> {
         }
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn no_shard_counts_as_finished_once_shards_are_on_their_way() {
+        let folder = tempfile::tempdir().unwrap();
+        let checkpoints = folder.path().join("checkpoints");
+        for split in ["train", "test"] {
+            let place = checkpoints.join(SHARDS).join(split).join("camera");
+            std::fs::create_dir_all(&place).unwrap();
+            std::fs::write(place.join("shard-000000.tar"), b"tokens").unwrap();
+            std::fs::create_dir_all(checkpoints.join(MARKERS)).unwrap();
+            let marker = checkpoints.join(MARKERS).join(format!("{split}-000000"));
+            std::fs::write(marker, b"").unwrap();
+        }
+        let output = folder.path().join("output");
+        std::fs::create_dir(&output).unwrap();
+        std::fs::write(output.join("test"), b"a file in the way of the folder").unwrap();
+        assert!(deliver_splits(&checkpoints, &["train", "test"], &output).is_err());
+        assert!(output.join("train/camera/shard-000000.tar").is_file());
+        assert!(!checkpoints.join(MARKERS).exists());
+    }
 }

@@ -179,11 +179,9 @@ impl Op for TrainMget {
                 format!("{} weights for {sets} data sets", settings.weights.len()),
             ));
         }
-        if settings.device == DeviceChoice::Cpu && settings.precision == Precision::Bf16 {
-            problems.push(
-                Problem::new(Code::E0206, "precision", "`bf16` is not available on `cpu`")
-                    .help("use `f32`"),
-            );
+        if settings.precision == Precision::Bf16 {
+            let message = "`bf16` is not available: no operation computes in it yet";
+            problems.push(Problem::new(Code::E0206, "precision", message).help("use `f32`"));
         }
         let shape = pixel_shape(tokens);
         if settings.pixels == Pixels::Rgb && shape.is_none() {
@@ -200,8 +198,7 @@ impl Op for TrainMget {
         if let Err(error) = settings.masking.settings.check(&spec.slots()) {
             problems.push(masking_problem(&error));
         }
-        let clips = tokens.clips.get("train").copied().unwrap_or(1);
-        let measure = measure(settings, settings.used(clips));
+        let measure = measure(settings, training_clips(settings, inputs));
         if let Err(error) = settings.training.learning_rates(measure) {
             problems.push(Problem::new(Code::E0206, "", error.to_string()));
         }
@@ -227,8 +224,7 @@ impl Op for TrainMget {
             return StagePlan::default();
         };
         let spec = spec(settings, &tokens.tokens, pixel_shape(tokens));
-        let clips = tokens.clips.get("train").copied().unwrap_or(1);
-        let measure = measure(settings, settings.used(clips));
+        let measure = measure(settings, training_clips(settings, inputs));
         let training = &settings.training;
         let Ok(steps) = training.total_steps(measure) else {
             return StagePlan::default();
@@ -336,6 +332,16 @@ fn spec(
     }
 }
 
+/// The training clips that are used, of all data sets.
+fn training_clips(settings: &TrainMgetSettings, inputs: &Inputs<'_>) -> u64 {
+    ["tokens", "more_tokens"]
+        .iter()
+        .flat_map(|port| inputs.all(port))
+        .map(|facts| facts.description.clips.get("train").copied().unwrap_or(1))
+        .map(|clips| settings.used(clips))
+        .sum()
+}
+
 fn measure(settings: &TrainMgetSettings, clips: u64) -> Measure {
     let masking = &settings.masking.settings;
     Measure {
@@ -373,4 +379,32 @@ fn masking_problem(error: &MaskingError) -> Problem {
         _ => "masking".to_owned(),
     };
     Problem::new(Code::E0206, key, error.to_string())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::experiment::InputFacts;
+
+    #[test]
+    fn epochs_are_of_all_data_sets_and_shares_of_each() {
+        let described = |clips: u64| Description {
+            clips: [("train".to_owned(), clips)].into(),
+            ..Description::default()
+        };
+        let (a, b, c) = (described(100), described(31), described(5));
+        let facts = |description| InputFacts {
+            stage: "tokens",
+            kind: ArtifactKind::Tokens,
+            description,
+        };
+        let inputs = Inputs::new(vec![
+            ("tokens", vec![facts(&a)]),
+            ("more_tokens", vec![facts(&b), facts(&c)]),
+        ]);
+        let mut settings = TrainMgetSettings::default();
+        assert_eq!(training_clips(&settings, &inputs), 136);
+        settings.train_share = 0.5;
+        assert_eq!(training_clips(&settings, &inputs), 50 + 16 + 3);
+    }
 }

@@ -94,19 +94,19 @@ pub(super) fn refused(error: SourceError) -> StageError {
 }
 
 /// Moves finished shards to where the artifact is written.
+///
+/// The markers go first: a marker that outlived its shard would make the next try publish an artifact without it.
 pub(super) fn deliver(from: &Path, to: &Path) -> Result<(), StageError> {
+    let markers = from.join(MARKERS);
+    std::fs::remove_dir_all(&markers).map_err(StageError::io(&markers))?;
     for entry in std::fs::read_dir(from).map_err(StageError::io(from))? {
         let path = entry.map_err(StageError::io(from))?.path();
-        if path.file_name().is_some_and(|name| name == MARKERS) {
-            continue;
-        }
         std::fs::create_dir_all(to).map_err(StageError::io(to))?;
         let target = to.join(path.file_name().unwrap_or_default());
         if std::fs::rename(&path, &target).is_err() {
             copy(&path, &target)?;
         }
     }
-    // The shards are gone from here: their markers must not outlive them.
     std::fs::remove_dir_all(from).map_err(StageError::io(from))
 }
 
@@ -122,4 +122,26 @@ pub(super) fn copy(from: &Path, to: &Path) -> Result<(), StageError> {
     std::fs::copy(from, to)
         .map(|_| ())
         .map_err(StageError::io(from))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn no_shard_counts_as_finished_once_shards_are_on_their_way() {
+        let folder = tempfile::tempdir().unwrap();
+        let (from, to) = (folder.path().join("train"), folder.path().join("output"));
+        std::fs::create_dir_all(from.join(MARKERS)).unwrap();
+        std::fs::write(from.join(MARKERS).join("shard-000000.json"), b"{}").unwrap();
+        std::fs::create_dir_all(from.join("body/world")).unwrap();
+        std::fs::write(from.join("body/world/shard-000000.tar"), b"clips").unwrap();
+        std::fs::write(&to, b"a file in the way of the folder").unwrap();
+        assert!(deliver(&from, &to).is_err());
+        assert!(!from.join(MARKERS).exists());
+        std::fs::remove_file(&to).unwrap();
+        std::fs::create_dir(from.join(MARKERS)).unwrap();
+        deliver(&from, &to).unwrap();
+        assert!(to.join("body/world/shard-000000.tar").is_file() && !to.join(MARKERS).exists());
+    }
 }

@@ -5,7 +5,7 @@ use crate::decoding::reconstructor::{Binding, TOKENIZERS};
 use crate::engine::{Compute, Initialise};
 use crate::experiment::{Code, InputArtifact, StageContext, StageError, TokenFacts};
 use crate::masking::{Masking, PIXELS};
-use crate::mget::Mget;
+use crate::mget::{Mget, MgetSpec};
 use crate::modality::ClipFormat;
 use crate::run::checkpoint;
 use crate::run::environment::Stopwatch;
@@ -39,6 +39,11 @@ fn input_error(error: impl Into<TrainingError>) -> StageError {
                 help: "make the tokens again with the tokenizers of this experiment".into(),
             }
         }
+        TrainingError::Data(error @ DataError::Twice { .. }) => StageError::Input {
+            code: Code::E0401,
+            message: error.to_string(),
+            help: "keep the data sets in folders of their own, or rename the clips of one".into(),
+        },
         error => StageError::other(error),
     }
 }
@@ -77,6 +82,7 @@ impl Run {
         let masking =
             Masking::new(&settings.masking.settings, &spec.slots()).map_err(StageError::other)?;
 
+        same_tokenizers(&spec, &artifacts)?;
         let mut sources: Vec<Arc<dyn TokenSource>> = Vec::new();
         for artifact in &artifacts {
             let shards = Shards::open(&artifact.path.join("train"), &artifact.stage, &spec)
@@ -107,7 +113,8 @@ impl Run {
             seed,
         )
         .map_err(input_error)?;
-        let unigram = Unigram::fit(&spec, &sources, UNIGRAM_CLIPS).map_err(input_error)?;
+        let unigram =
+            Unigram::fit(&spec, &sources, &lengths, UNIGRAM_CLIPS).map_err(input_error)?;
         let baseline = validation.baseline(&unigram);
 
         let compute =
@@ -311,10 +318,90 @@ impl Run {
     }
 }
 
+/// Refuses token sets of other tokenizers than the first one's: the same numbers would mean other signals, in grids that fit.
+///
+/// Sets that bring no tokenizer of a modality are believed.
+fn same_tokenizers(spec: &MgetSpec, artifacts: &[InputArtifact]) -> Result<(), StageError> {
+    let Some((first, others)) = artifacts.split_first().filter(|(_, o)| !o.is_empty()) else {
+        return Ok(());
+    };
+    let digests = |artifact: &InputArtifact| Binding::digests(&artifact.path);
+    let known = digests(first).map_err(StageError::other)?;
+    for other in others {
+        let found = digests(other).map_err(StageError::other)?;
+        for name in spec.modalities.iter().map(|modality| &modality.name) {
+            if let (Some(known), Some(found)) = (known.get(name), found.get(name))
+                && known != found
+            {
+                return Err(StageError::Input {
+                    code: Code::E0401,
+                    message: format!(
+                        "`{}` and `{}` were made with different tokenizers of `{name}`",
+                        first.stage, other.stage
+                    ),
+                    help: "make all tokens with the same tokenizers".into(),
+                });
+            }
+        }
+    }
+    Ok(())
+}
+
 fn damaged(reason: &str) -> StageError {
     StageError::Input {
         code: Code::E0601,
         message: format!("the tokens artifact cannot be used: {reason}"),
         help: "run the stage that makes it again".into(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::mget::{ModalitySpec, Positions, Size};
+    use std::path::Path;
+
+    fn tokens(root: &Path, stage: &str, tokenizer: Option<&[u8]>) -> InputArtifact {
+        let path = root.join(stage);
+        if let Some(bytes) = tokenizer {
+            let folder = path.join(TOKENIZERS).join("camera");
+            std::fs::create_dir_all(&folder).unwrap();
+            std::fs::write(folder.join("weights.safetensors"), bytes).unwrap();
+        }
+        InputArtifact {
+            stage: stage.to_owned(),
+            op: "tokenize".to_owned(),
+            path,
+            contents: Value::Null,
+        }
+    }
+
+    #[test]
+    fn tokens_of_other_tokenizers_are_refused_and_both_stages_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let root = folder.path();
+        let of = |name: &str| MgetSpec {
+            size: Size::default(),
+            positions: Positions::Released,
+            modalities: vec![ModalitySpec::tokens(name, &[30], 64)],
+        };
+        let first = tokens(root, "first", Some(b"a"));
+        let same = tokens(root, "same", Some(b"a"));
+        let other = tokens(root, "other", Some(b"b"));
+        let unknown = tokens(root, "unknown", None);
+        let check = |spec: &str, sets: &[&InputArtifact]| {
+            let sets: Vec<InputArtifact> = sets.iter().map(|set| (*set).clone()).collect();
+            same_tokenizers(&of(spec), &sets)
+        };
+        check("camera", &[&first, &same, &unknown]).unwrap();
+        check("gaze", &[&first, &other]).unwrap();
+        check("camera", &[&other]).unwrap();
+        match check("camera", &[&first, &same, &other]) {
+            Err(StageError::Input { code, message, .. }) => {
+                assert_eq!(code, Code::E0401);
+                assert!(message.contains("`first` and `other`"), "{message}");
+            }
+            other => panic!("{other:?}"),
+        }
     }
 }
