@@ -20,7 +20,7 @@ use crate::source::video::VideoSettings;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 /// Settings of [`Reconstruct`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -97,7 +97,7 @@ impl Op for Reconstruct {
     }
 
     fn version(&self) -> u32 {
-        3
+        4
     }
 
     fn about(&self) -> &'static str {
@@ -126,26 +126,19 @@ impl Op for Reconstruct {
     }
 
     fn files(&self, settings: &ReconstructSettings) -> Vec<FileInput> {
-        let mut files: Vec<FileInput> = [("video", &settings.video), ("anchor", &settings.anchor)]
-            .into_iter()
-            .filter_map(|(key, path)| {
-                Some(FileInput {
-                    key: key.to_owned(),
-                    path: path.as_ref()?.0.clone().into(),
-                })
+        [
+            ("video", &settings.video),
+            ("anchor", &settings.anchor),
+            ("model_folder", &settings.model_folder),
+        ]
+        .into_iter()
+        .filter_map(|(key, path)| {
+            Some(FileInput {
+                key: key.to_owned(),
+                path: path.as_ref()?.0.clone().into(),
             })
-            .collect();
-        if let Some(folder) = &settings.model_folder {
-            files.extend(
-                model_files(folder.as_ref())
-                    .into_iter()
-                    .map(|path| FileInput {
-                        key: "model_folder".to_owned(),
-                        path,
-                    }),
-            );
-        }
-        files
+        })
+        .collect()
     }
 
     fn check(
@@ -242,24 +235,4 @@ impl Op for Reconstruct {
         };
         run::run(settings, &model, context)
     }
-}
-
-/// The files of a model folder; the folder itself where there are none, so that its absence is found.
-fn model_files(folder: &Path) -> Vec<PathBuf> {
-    let mut files = Vec::new();
-    let mut open = vec![folder.to_path_buf()];
-    while let Some(here) = open.pop() {
-        for entry in std::fs::read_dir(&here).into_iter().flatten().flatten() {
-            let path = entry.path();
-            match entry.file_type() {
-                Ok(kind) if kind.is_dir() => open.push(path),
-                _ => files.push(path),
-            }
-        }
-    }
-    files.sort();
-    if files.is_empty() {
-        files.push(folder.to_path_buf());
-    }
-    files
 }

@@ -1,13 +1,14 @@
 //! Metric depth of another model, to which relative depth is fitted (Supp. D).
 //!
-//! One map per frame of the model's video, in time order: an npz with one array `[T, H, W]` (or one named `depth`), or a folder
-//! of OpenEXR files (their `Z` or first channel, as ViPE writes them) or of 16-bit PNG in millimetres. What is zero, negative
-//! or not finite is unknown.
+//! Maps of the whole video or of the model's frames, in time order: an npz with one array `[T, H, W]` (or one named `depth`), or
+//! a folder of OpenEXR files (their `Z` or first channel, as ViPE writes them) or of 16-bit PNG in millimetres. Of each, the
+//! centre square is taken, as of the video. What is zero, negative or not finite is unknown.
 
+use super::folder::thin;
 use crate::formats::FormatError;
 use crate::formats::npz::Npz;
 use crate::source::image::grey16_from_png;
-use ndarray::{Array2, Array3, Axis};
+use ndarray::{Array2, Array3, ArrayView2, Axis, s};
 use std::path::{Path, PathBuf};
 
 /// Maps are this wide or high at most.
@@ -40,11 +41,11 @@ fn malformed(path: &Path, reason: impl std::fmt::Display) -> AnchorError {
     }
 }
 
-/// `[T, H, W]` metres for `frames` frames; NaN where unknown. More maps than frames are thinned evenly, as when the other model
-/// has seen the whole video.
+/// `[T, S, S]` metres for `frames` frames on the grid that the fits use; NaN where unknown. More maps than frames are thinned
+/// evenly, as when the other model has seen the whole video.
 ///
 /// # Errors
-/// When the files cannot be read, are of different sizes, or are fewer than the frames.
+/// When the files cannot be read, are empty or of different sizes, or are fewer than the frames.
 pub fn read(path: &Path, frames: usize) -> Result<Array3<f32>, AnchorError> {
     let mut maps = if path.is_dir() {
         folder(path, frames)?
@@ -70,7 +71,53 @@ fn chosen(path: &Path, found: usize, frames: usize) -> Result<Vec<usize>, Anchor
             found,
         });
     }
-    Ok((0..frames).map(|frame| frame * found / frames).collect())
+    let nearest =
+        |frame: usize| ((frame * found) as f64 / frames as f64).round_ties_even() as usize;
+    Ok((0..frames)
+        .map(|frame| nearest(frame).min(found - 1))
+        .collect())
+}
+
+/// The centre square of a map, on the grid that the fits use.
+fn square(map: ArrayView2<'_, f32>) -> Array2<f32> {
+    let (height, width) = map.dim();
+    let side = height.min(width);
+    let (top, left) = ((height - side) / 2, (width - side) / 2);
+    thin(map.slice(s![top..top + side, left..left + side]))
+}
+
+/// Maps of one size, one after the other.
+#[derive(Debug, Default)]
+struct Maps {
+    /// Height and width of the first, before it was cut.
+    size: Option<(usize, usize)>,
+    squares: Vec<Array2<f32>>,
+}
+
+impl Maps {
+    fn push(&mut self, path: &Path, map: ArrayView2<'_, f32>) -> Result<(), AnchorError> {
+        let (height, width) = map.dim();
+        if map.is_empty() {
+            return Err(malformed(path, format_args!("{width} x {height} pixels")));
+        }
+        let first = *self.size.get_or_insert(map.dim());
+        if first != map.dim() {
+            return Err(malformed(
+                path,
+                format_args!(
+                    "{width} x {height} pixels, the first has {} x {}",
+                    first.1, first.0
+                ),
+            ));
+        }
+        self.squares.push(square(map));
+        Ok(())
+    }
+
+    fn finish(self, path: &Path) -> Result<Array3<f32>, AnchorError> {
+        let views: Vec<_> = self.squares.iter().map(|square| square.view()).collect();
+        ndarray::stack(Axis(0), &views).map_err(|error| malformed(path, error))
+    }
 }
 
 fn npz(path: &Path, frames: usize) -> Result<Array3<f32>, AnchorError> {
@@ -81,8 +128,11 @@ fn npz(path: &Path, frames: usize) -> Result<Array3<f32>, AnchorError> {
         _ => "depth".to_owned(),
     };
     let array: Array3<f32> = file.get(&name)?.to_dim()?;
-    let keep = chosen(path, array.len_of(Axis(0)), frames)?;
-    Ok(array.select(Axis(0), &keep))
+    let mut maps = Maps::default();
+    for index in chosen(path, array.len_of(Axis(0)), frames)? {
+        maps.push(path, array.index_axis(Axis(0), index))?;
+    }
+    maps.finish(path)
 }
 
 fn folder(path: &Path, frames: usize) -> Result<Array3<f32>, AnchorError> {
@@ -100,23 +150,11 @@ fn folder(path: &Path, frames: usize) -> Result<Array3<f32>, AnchorError> {
     if files.is_empty() {
         return Err(malformed(path, "no .exr and no .png in this folder"));
     }
-    let mut maps: Option<Array3<f32>> = None;
-    for (index, file) in chosen(path, files.len(), frames)?.into_iter().enumerate() {
-        let map = map(&files[file])?;
-        let (height, width) = map.dim();
-        let maps = maps.get_or_insert_with(|| Array3::from_elem((frames, height, width), f32::NAN));
-        if maps.shape()[1..] != [height, width] {
-            return Err(malformed(
-                &files[file],
-                format_args!(
-                    "{width} x {height} pixels, the first has {:?}",
-                    &maps.shape()[1..]
-                ),
-            ));
-        }
-        maps.index_axis_mut(Axis(0), index).assign(&map);
+    let mut maps = Maps::default();
+    for index in chosen(path, files.len(), frames)? {
+        maps.push(&files[index], map(&files[index])?.view())?;
     }
-    maps.ok_or_else(|| malformed(path, "no depth map"))
+    maps.finish(path)
 }
 
 fn extension(file: &Path) -> String {
@@ -180,18 +218,23 @@ mod tests {
         for (index, value) in [1500_u16, 0].into_iter().enumerate() {
             let file =
                 std::fs::File::create(folder.path().join(format!("{index:03}.png"))).unwrap();
-            let mut encoder = png::Encoder::new(file, 2, 1);
+            let mut encoder = png::Encoder::new(file, 4, 2);
             encoder.set_color(png::ColorType::Grayscale);
             encoder.set_depth(png::BitDepth::Sixteen);
             let mut writer = encoder.write_header().unwrap();
-            let data: Vec<u8> = [value, value]
+            // The sides are cut off.
+            let row = [9000, value, value + 250 * u16::from(value > 0), 9000];
+            let data: Vec<u8> = row
                 .iter()
+                .chain(&row)
                 .flat_map(|v| v.to_be_bytes())
                 .collect();
             writer.write_image_data(&data).unwrap();
         }
         let maps = read(folder.path(), 2).unwrap();
-        assert_eq!(maps[[0, 0, 1]], 1.5);
+        assert_eq!(maps.dim(), (2, 2, 2));
+        assert_eq!(maps[[0, 1, 0]], 1.5);
+        assert_eq!(maps[[0, 1, 1]], 1.75);
         assert!(maps[[1, 0, 0]].is_nan());
         assert!(matches!(
             read(folder.path(), 3),
@@ -200,13 +243,21 @@ mod tests {
     }
 
     #[test]
+    fn of_more_maps_than_frames_the_nearest_in_time_are_taken() {
+        let of = |found, frames| chosen(Path::new("a"), found, frames).unwrap();
+        assert_eq!(of(60, 16)[..4], [0, 4, 8, 11]);
+        assert_eq!(of(3, 3), [0, 1, 2]);
+        assert_eq!(of(5, 4), [0, 1, 2, 4]);
+    }
+
+    #[test]
     fn half_floats_of_open_exr_are_read() {
         use ::exr::prelude::{AnyChannel, AnyChannels, Image, Layer, WritableImage, f16};
         let folder = tempfile::tempdir().unwrap();
-        let values = vec![f16::from_f32(0.5), f16::from_f32(2.25)];
+        let values = vec![f16::from_f32(0.5), f16::from_f32(2.25), f16::ZERO, f16::ONE];
         let channel = AnyChannel::new("Z", ::exr::prelude::FlatSamples::F16(values));
         let layer = Layer::new(
-            (2, 1),
+            (2, 2),
             ::exr::prelude::LayerAttributes::named("depth"),
             ::exr::prelude::Encoding::SMALL_LOSSLESS,
             AnyChannels::sort([channel].into_iter().collect()),
@@ -214,7 +265,8 @@ mod tests {
         let path = folder.path().join("000.exr");
         Image::from_layer(layer).write().to_file(&path).unwrap();
         let maps = read(folder.path(), 1).unwrap();
-        assert_eq!(maps.iter().copied().collect::<Vec<_>>(), [0.5, 2.25]);
+        assert_eq!(maps[[0, 0, 1]], 2.25);
+        assert!(maps[[0, 1, 0]].is_nan());
         std::fs::write(&path, b"not an exr").unwrap();
         assert!(matches!(
             read(folder.path(), 1),

@@ -101,6 +101,8 @@ pub struct DepthFit {
 pub enum ScaleRefusal {
     #[error("no body in the reconstruction, so no feet to stand on")]
     NoBody,
+    #[error("no camera path in the reconstruction, so no rays to the floor")]
+    NoCamera,
     #[error("only {found} foot samples, at least 2 are needed")]
     NoFeet { found: usize },
     #[error("only {found} depth points, at least 100 are needed")]

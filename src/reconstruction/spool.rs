@@ -94,7 +94,7 @@ impl DepthSpool {
         let mut member = member
             .into_inner()
             .map_err(std::io::IntoInnerError::into_error)?;
-        let mut out = tempfile::NamedTempFile::new_in(folder)?;
+        let mut out = crate::formats::temporary_in(folder)?;
         let mut zip = ZipWriter::new(BufWriter::new(out.as_file_mut()));
         zip.add_file(&format!("{name}.npy"), &mut member)?;
         zip.finish()?;

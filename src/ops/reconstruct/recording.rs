@@ -172,12 +172,14 @@ impl Recording {
         let mut lens_settings = settings.lens;
         let camera = clip.camera.as_ref();
         let known = camera.and_then(|camera| camera.intrinsics);
+        let mut up_known = false;
         if let Some(camera) = camera
             && let (Some(up), Some(pose)) = (camera.up_world, camera.T_world_camera.first())
             && camera.valid.first() == Some(&true)
         {
             let up = pose.rotation.inverse() * up.into_inner();
             lens_settings.up = Some([up.x, up.y, up.z]);
+            up_known = true;
         }
         let size = format.size as u32;
         let intrinsics = match known {
@@ -186,16 +188,17 @@ impl Recording {
                 .intrinsics([size, size], size)
                 .map_err(|error| lens(&error))?,
         };
-        let mut assumptions = vec![fact("Clip", &clip.id)];
+        let [mut lens_fact, mut up_fact] = said(&lens_settings, &intrinsics);
         if known.is_some() {
-            assumptions.push(fact(
+            lens_fact = fact(
                 "Intrinsics",
                 format_args!("{}, from the clip", words(&intrinsics)),
-            ));
-            assumptions.push(fact("Up", "from the clip"));
-        } else {
-            assumptions.extend(said(&lens_settings, &intrinsics));
+            );
         }
+        if up_known {
+            up_fact = fact("Up", "from the clip");
+        }
+        let assumptions = vec![fact("Clip", &clip.id), lens_fact, up_fact];
         let mut badges = Vec::new();
         if clip.source == "world" {
             badges.push(Badge {
@@ -295,7 +298,7 @@ fn words(lens: &Intrinsics) -> String {
 }
 
 /// What the settings say of the camera, and what is assumed instead.
-fn said(settings: &LensSettings, lens: &Intrinsics) -> Vec<Fact> {
+fn said(settings: &LensSettings, lens: &Intrinsics) -> [Fact; 2] {
     let from = match settings.calibration {
         Some(_) => "from `lens.calibration`".to_owned(),
         None => format!(
@@ -307,7 +310,7 @@ fn said(settings: &LensSettings, lens: &Intrinsics) -> Vec<Fact> {
         Some(_) => "from `lens.up`".to_owned(),
         None => "ASSUMED: the first camera is level (`lens.up`)".to_owned(),
     };
-    vec![
+    [
         fact("Intrinsics", format_args!("{}, {from}", words(lens))),
         fact("Up", up),
     ]

@@ -79,6 +79,13 @@ pub(super) fn run(
     let recording = Recording::open(settings, clips.as_ref(), &format)?;
     let list = windows(recording.seconds, settings.overlap)
         .map_err(|error| input(error, "choose another `overlap`"))?;
+    let has = |name: &str| wanted.iter().any(|wanted| wanted == name);
+    if list.len() > 1 && has("body") && !has("camera") {
+        return Err(input(
+            "`body` over several windows needs the camera path, which says where each window starts",
+            "add `camera` to `wanted`",
+        ));
+    }
     let samples = samples_of(recording.seconds);
     let rate = format.video_rate;
     let frames = ((recording.seconds * rate - 1e-6).ceil() as usize).max(1);
@@ -98,7 +105,7 @@ pub(super) fn run(
         .as_ref()
         .map(|path| anchor::read(path.as_ref(), frames))
         .transpose()
-        .map_err(|error| input(error, "see `anchor` in `reviv list`"))?;
+        .map_err(|error| input(error, "see `anchor` in `reviv show reconstruct`"))?;
     let setting = Setting {
         title: recording.title.clone(),
         video_rate: rate,

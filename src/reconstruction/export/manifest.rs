@@ -55,12 +55,14 @@ impl ArrayFile {
         self
     }
 
-    /// Writes `folder/name` and returns the facts with the file name in them.
+    /// Writes `folder/name` and returns the facts with the file name in them; without arrays there is no file.
     ///
     /// # Errors
     /// When the file cannot be written.
     pub fn write(mut self, folder: &Path, name: &str) -> Result<Vec<ArrayFacts>, FormatError> {
-        self.arrays.write(&folder.join(name))?;
+        if !self.facts.is_empty() {
+            self.arrays.write(&folder.join(name))?;
+        }
         for facts in &mut self.facts {
             name.clone_into(&mut facts.file);
         }

@@ -17,13 +17,13 @@ use super::scale::{
 use super::spool::DepthSpool;
 use super::stitch::{Seam, Stitcher, Tracks, gravity_to_world};
 use super::windows::Window;
-use crate::clip::clock::SIGNAL_RATE;
+use crate::clip::clock::{SIGNAL_RATE, SIGNAL_SAMPLES};
 use crate::clip::{Clip, Intrinsics};
 use crate::formats::FormatError;
 use crate::geometry::rigid::Rigid;
 use crate::geometry::skeleton::BODY;
 use crate::view::{Badge, Fact, VideoFrames, ViewError, write_page};
-use ndarray::{Array2, Array3, ArrayView3, ArrayView4, Axis};
+use ndarray::{Array2, Array3, ArrayView2, ArrayView3, ArrayView4, Axis};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::io::Write;
@@ -36,7 +36,7 @@ pub const PAGE: &str = "view.html";
 
 /// Side of the depth grid that the page and the fits use; the file keeps the full resolution.
 const GRID: usize = 64;
-/// Points of the whole recording in `points.ply`, at most.
+/// Points of the whole recording in `points.ply` and in the fits, at most.
 const POINTS: usize = 2_000_000;
 /// Depth is never nearer than this, metres.
 const NEAREST: f32 = 0.01;
@@ -55,7 +55,7 @@ pub struct Setting {
     /// World pose of the first camera.
     pub first: Rigid,
     pub floor_fit: FloorFit,
-    /// `[T, h, w]` metric depth of another model at the frames of this video; NaN where unknown.
+    /// `[T, S, S]` metric depth of another model at the frames of this video; NaN where unknown.
     pub anchor: Option<Array3<f32>>,
     /// What was assumed and where it came from, with the flag that overrides it.
     pub assumptions: Vec<Fact>,
@@ -142,7 +142,8 @@ impl Folder {
         })
     }
 
-    /// Adds a window: its frames `[T, S, S, 3]`, the decoded clip, and per modality a confidence per motion sample.
+    /// Adds a window: its frames `[T, S, S, 3]`, the decoded clip, and per modality the confidence of its samples, at any
+    /// rate, over the whole window.
     ///
     /// # Errors
     /// When a frame cannot be stored or the disk is full.
@@ -162,11 +163,16 @@ impl Folder {
         }
         self.stitcher.push(window, decoded);
         for (name, values) in confidence {
+            if values.is_empty() {
+                continue;
+            }
+            // Signals have rates of their own: spread over the motion samples of the window.
+            let at = |sample: usize| values[sample * values.len() / SIGNAL_SAMPLES];
             let held = self.confidence.entry(name.clone()).or_default();
             held.truncate(window.start + window.overlap / 2);
             held.resize(window.start.max(held.len()), f32::NAN);
             let from = held.len() - window.start;
-            held.extend(values.iter().take(window.inside).skip(from));
+            held.extend((from..window.inside).map(at));
         }
         if let Some(depth) = &decoded.depth {
             let done = self.depth.push(window.index, start, depth.metres.view());
@@ -243,7 +249,7 @@ impl Folder {
                     path: self.path.clone(),
                     error,
                 })?;
-                self.grids.push(thin(frame));
+                self.grids.push(thin(frame.view()));
             }
         }
         Ok(())
@@ -259,9 +265,8 @@ impl Folder {
         }
         let (by, fit) = match &self.setting.anchor {
             Some(anchor) => ("anchor depth", self.fit_to_anchor(anchor)),
-            None if tracks.camera.is_empty() || tracks.body.is_empty() => {
-                ("floor fit", Err(ScaleRefusal::NoBody))
-            }
+            None if tracks.camera.is_empty() => ("floor fit", Err(ScaleRefusal::NoCamera)),
+            None if tracks.body.is_empty() => ("floor fit", Err(ScaleRefusal::NoBody)),
             None => ("floor fit", self.fit_to_floor(tracks, floor)),
         };
         match fit {
@@ -273,7 +278,7 @@ impl Folder {
     fn fit_to_floor(&self, tracks: &Tracks, floor: Option<f64>) -> Result<DepthFit, ScaleRefusal> {
         let floor = floor.ok_or(ScaleRefusal::NoFeet { found: 0 })?;
         let mut rays = Vec::new();
-        for (frame, grid) in self.grids.iter().enumerate() {
+        for (frame, grid) in self.grids.iter().enumerate().step_by(self.stride()) {
             let pose = tracks.camera[self.sample_of(frame, tracks.camera.len())];
             for ((row, column), &depth) in grid.indexed_iter() {
                 let [x, y] = ray(
@@ -290,7 +295,8 @@ impl Folder {
 
     fn fit_to_anchor(&self, anchor: &Array3<f32>) -> Result<DepthFit, ScaleRefusal> {
         let mut pairs = Vec::new();
-        for (grid, metric) in self.grids.iter().zip(anchor.axis_iter(Axis(0))) {
+        let both = self.grids.iter().zip(anchor.axis_iter(Axis(0)));
+        for (grid, metric) in both.step_by(self.stride()) {
             let (rows, columns) = metric.dim();
             for ((row, column), &depth) in grid.indexed_iter() {
                 let at = [
@@ -303,6 +309,12 @@ impl Folder {
         fit_anchor(&pairs)
     }
 
+    /// Every how many frames are taken, so that no more than [`POINTS`] cells are.
+    fn stride(&self) -> usize {
+        let cells: usize = self.grids.iter().map(Array2::len).sum();
+        cells.div_ceil(POINTS).max(1)
+    }
+
     fn sample_of(&self, frame: usize, samples: usize) -> usize {
         let sample = (frame as f64 / self.setting.video_rate * SIGNAL_RATE).round_ties_even();
         (sample as usize).min(samples.saturating_sub(1))
@@ -312,20 +324,17 @@ impl Folder {
         if tracks.camera.is_empty() || self.grids.is_empty() {
             return Vec::new();
         }
-        let cells: usize = self.grids.iter().map(Array2::len).sum();
-        let every = cells.div_ceil(POINTS).max(1);
+        let frames = self.grids.iter().zip(&self.colors).enumerate();
         let mut points = Vec::new();
-        for (frame, (grid, colors)) in self.grids.iter().zip(&self.colors).enumerate() {
-            if frame.is_multiple_of(every) {
-                let pose = &tracks.camera[self.sample_of(frame, tracks.camera.len())];
-                points.extend(lift(
-                    grid.view(),
-                    colors.view(),
-                    &self.setting.intrinsics,
-                    pose,
-                    1,
-                ));
-            }
+        for (frame, (grid, colors)) in frames.step_by(self.stride()) {
+            let pose = &tracks.camera[self.sample_of(frame, tracks.camera.len())];
+            points.extend(lift(
+                grid.view(),
+                colors.view(),
+                &self.setting.intrinsics,
+                pose,
+                1,
+            ));
         }
         points
     }
@@ -345,7 +354,7 @@ fn foot_heights(tracks: &Tracks) -> Vec<f64> {
 }
 
 /// At most [`GRID`] cells a side: the values at the cells' centres.
-fn thin(frame: &Array2<f32>) -> Array2<f32> {
+pub(super) fn thin(frame: ArrayView2<'_, f32>) -> Array2<f32> {
     let (rows, columns) = (frame.nrows().min(GRID), frame.ncols().min(GRID));
     Array2::from_shape_fn((rows, columns), |(row, column)| {
         frame[[

@@ -108,9 +108,11 @@ fn fact(label: &str, value: &str) -> Fact {
 }
 
 fn worst_seam(seams: &[Seam]) -> Option<String> {
-    let worst = seams
-        .iter()
-        .max_by(|a, b| a.body_m.unwrap_or(0.0).total_cmp(&b.body_m.unwrap_or(0.0)))?;
+    let size = |seam: &Seam| {
+        let parts = [seam.body_m, seam.camera_m, seam.hands_m];
+        parts.into_iter().flatten().fold(0.0, f64::max)
+    };
+    let worst = seams.iter().max_by(|a, b| size(a).total_cmp(&size(b)))?;
     let part =
         |name: &str, value: Option<f64>| value.map(|v| format!("{name} {:.0} mm", v * 1000.0));
     let parts = [
