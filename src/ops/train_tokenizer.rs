@@ -125,7 +125,7 @@ impl Op for TrainTokenizer {
     }
 
     fn version(&self) -> u32 {
-        3
+        4
     }
 
     fn about(&self) -> &'static str {
@@ -183,6 +183,11 @@ impl Op for TrainTokenizer {
         if !(settings.rate.is_finite() && settings.rate > 0.0) {
             let message = format!("a learning rate of {}", settings.rate);
             problems.push(Problem::new(Code::E0202, "rate", message));
+        }
+        if let Some(name) = settings.optimizer.wrong() {
+            let place = format!("optimizer.{name}");
+            let message = format!("`{place}` is out of its range");
+            problems.push(Problem::new(Code::E0206, place, message));
         }
         if clips.clips.get("train").is_none_or(|count| *count == 0) {
             let problem = Problem::new(Code::E0401, "clips", "the clips have no `train` split");

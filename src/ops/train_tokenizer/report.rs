@@ -39,7 +39,7 @@ pub(super) fn markdown(
     }
     let _ = write!(
         page,
-        "Reconstruction of {} held-out clips:\n\n| error | tokenizer | predicting the mean | k-means, {} codes |\n|---|---|---|---|\n",
+        "Reconstruction of {} held-out clips:\n\n| error | tokenizer | predicting the mean | k-means, {} codes | better than k-means by, 95 % interval over clips |\n|---|---:|---:|---:|---:|\n",
         scores.clips, tokens.vocabulary,
     );
     for (name, value) in &scores.reconstruction {
@@ -53,9 +53,12 @@ pub(super) fn markdown(
                 .get(name)
                 .map_or_else(|| "not computed".to_owned(), |value| format!("{value:.3}"))
         };
+        let gain = scores.gain.get(name).map_or_else(String::new, |gain| {
+            format!("{:.3} [{:.3}, {:.3}]", gain.mean, gain.low, gain.high)
+        });
         let _ = writeln!(
             page,
-            "| {words} | {value:.3} | {} | {} |",
+            "| {words} | {value:.3} | {} | {} | {gain} |",
             other(&scores.mean),
             other(&scores.kmeans),
         );

@@ -283,14 +283,16 @@ fn read_signals(
         signals.extend(own.into_iter().map(|found| found.signal));
         if let Some(other) = &other {
             let found = extract(&data.train, other.as_ref(), &[], range)?;
-            signals.extend(found.iter().map(|found| mirrored(&found.signal)));
+            for found in &found {
+                signals.push(mirrored(&found.signal).map_err(StageError::other)?);
+            }
         }
     }
     Ok(signals)
 }
 
-/// Statistics of the training signals, or the fixed ones where the reference has them: gaze becomes [-1, 1] (model reference
-/// 1.2), and what is declared `normalize: none` stays.
+/// Statistics of the training signals, or the fixed ones where the reference has them: gaze becomes [-1, 1], and
+/// what is declared `normalize: none` stays.
 fn normaliser(
     settings: &TrainTokenizerSettings,
     data: &Data,
@@ -465,11 +467,13 @@ fn save(training: &dyn Training, context: &mut dyn StageContext) -> Result<(), S
 
 fn failed(error: TrainingError, settings: &TrainTokenizerSettings) -> StageError {
     match error {
-        error @ TrainingError::NotFinite { .. } => StageError::Input {
-            code: Code::E0206,
-            message: error.to_string(),
-            help: format!("try a `rate` below {}", settings.rate),
-        },
+        error @ (TrainingError::NotFinite { .. } | TrainingError::Gradient(_)) => {
+            StageError::Input {
+                code: Code::E0206,
+                message: error.to_string(),
+                help: format!("try a `rate` below {}", settings.rate),
+            }
+        }
         TrainingError::NoData => StageError::Input {
             code: Code::E0401,
             message: format!("no training clip has the modality `{}`", settings.modality),

@@ -1,14 +1,14 @@
 //! How well a tokenizer reconstructs clips it never saw, beside what is possible without one.
 
 use super::super::clip_signals::{Extracted, extract};
-use super::errors::Errors;
+use super::errors::{Errors, Gain};
 use super::picture::{Example, VIDEOS};
 use crate::clip::Signal;
 use crate::clip::store::ClipSet;
+use crate::evaluation::tokens::codebook_use;
 use crate::experiment::{StageContext, StageError};
 use crate::modality::Modality;
 use crate::tokenizer::Tokenizer;
-use crate::training::tokenizer::usage;
 use serde::Serialize;
 use std::collections::BTreeMap;
 
@@ -34,6 +34,8 @@ pub(super) struct Scores {
     pub mean: BTreeMap<String, f64>,
     /// Of k-means with as many codes on the same patches; empty where there is none.
     pub kmeans: BTreeMap<String, f64>,
+    /// How much better the tokenizer is than k-means on the same clips.
+    pub gain: BTreeMap<String, Gain>,
     /// Tokens of all clips together.
     pub tokens: u64,
     /// Share of the codes that occur in them; bounded by `tokens / vocabulary`.
@@ -115,20 +117,20 @@ pub(super) fn score(
                 });
             }
         }
-        ids.extend(grids.into_iter().flat_map(|grid| grid.ids));
+        ids.extend(grids.into_iter().flat_map(|grid| grid.ids).map(i64::from));
         clips += found.len();
         context.progress(end as u64, most as u64, "held-out clips");
     }
-    let tokens = ids.len() as u64;
-    let used = (tokens > 0).then(|| usage(ids, tokenizer.vocabulary()));
+    let used = codebook_use(ids, tokenizer.vocabulary()).map_err(StageError::other)?;
     let scores = Scores {
         clips,
         reconstruction: own.means(),
         mean: mean.means(),
         kmeans: kmeans.means(),
-        tokens,
-        usage: used.map(|used| used.used),
-        perplexity: used.map(|used| used.perplexity),
+        gain: own.gain(&kmeans),
+        tokens: used.n_tokens as u64,
+        usage: used.usage,
+        perplexity: used.perplexity,
     };
     Ok((scores, examples))
 }
