@@ -118,20 +118,12 @@ mod tests {
 
     #[test]
     fn bf16_is_refused_by_name_with_the_device() {
-        for (choice, device) in [
-            (DeviceChoice::Cpu, "`cpu`"),
-            #[cfg(feature = "cuda")]
-            (DeviceChoice::Cuda, "`cuda:0`"),
-            #[cfg(feature = "vulkan")]
-            (DeviceChoice::Vulkan, "`vulkan:0`"),
-        ] {
-            let error = Compute::new(choice, 0, Precision::Bf16).unwrap_err();
-            let message = error.to_string();
-            assert!(
-                message.contains("`bf16`") && message.contains(device),
-                "{message}"
-            );
-        }
+        let error = Compute::new(DeviceChoice::Cpu, 0, Precision::Bf16).unwrap_err();
+        let message = error.to_string();
+        assert!(
+            message.contains("`bf16`") && message.contains("`cpu`"),
+            "{message}"
+        );
     }
 
     #[cfg(not(feature = "cuda"))]

@@ -75,3 +75,21 @@ pub fn codebook_use(
     }
     Ok(counts.summary())
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn usage_of_a_vocabulary_counts_codes_and_their_evenness() {
+        let even = codebook_use([0, 1, 2, 3], 8).unwrap();
+        assert_eq!((even.usage, even.n_tokens), (Some(0.5), 4));
+        assert!((even.perplexity.unwrap() - 4.0).abs() < 1e-12);
+        let one = codebook_use([5; 10], 8).unwrap();
+        assert_eq!((one.usage, one.perplexity), (Some(0.125), Some(1.0)));
+        assert_eq!(codebook_use([], 8).unwrap().perplexity, None);
+        for outside in [-1, 8] {
+            assert!(codebook_use([outside], 8).is_err());
+        }
+    }
+}

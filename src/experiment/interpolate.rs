@@ -223,8 +223,8 @@ mod tests {
         let list = vec!["1"; 500].join(", ");
         for use_of in ["${params.big}", "x ${params.big}"] {
             let text = format!("params: {{big: [{list}]}}\n");
-            let uses: String = (0..2000).map(|n| format!("k{n}: {use_of}\n")).collect();
-            let text = text + &uses;
+            let uses: Vec<String> = (0..2000).map(|n| format!("k{n}: {use_of}\n")).collect();
+            let text = text + &uses.concat();
             let mut diagnostics = Vec::new();
             let root = yaml::parse(&text, 0, &mut diagnostics).unwrap();
             assert!(diagnostics.is_empty());

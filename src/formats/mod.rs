@@ -85,10 +85,9 @@ pub(crate) fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), FormatEr
     Ok(())
 }
 
-#[cfg(all(test, unix))]
+#[cfg(test)]
 mod tests {
-    use super::*;
-
+    #[cfg(unix)]
     #[test]
     fn a_written_file_has_the_rights_of_any_new_file() {
         use std::os::unix::fs::PermissionsExt;
@@ -98,7 +97,7 @@ mod tests {
             std::fs::metadata(path).unwrap().permissions().mode()
         };
         std::fs::write(folder.path().join("plain"), b"1").unwrap();
-        write_atomically(&folder.path().join("renamed"), b"1").unwrap();
+        super::write_atomically(&folder.path().join("renamed"), b"1").unwrap();
         assert_eq!(rights("renamed"), rights("plain"));
     }
 }
