@@ -10,8 +10,8 @@ use crate::clip::Signal;
 use crate::engine::{Gradients, Parameters, Weights};
 use crate::tokenizer::video::VideoTokenizer;
 
-/// Weight of the latents' unevenness, as a share of the error of pixels: signals of much and of little contrast are pulled alike.
-const EVENNESS: f64 = 0.25;
+/// Weight of the latents' unevenness beside the error of pixels.
+const EVENNESS: f64 = 0.01;
 
 /// What one step reports.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -96,7 +96,7 @@ impl VideoTrainer {
             let step = step + 1;
             return Err(TrainingError::NotFinite { step, loss });
         }
-        let total = trained.loss + trained.unevenness * (EVENNESS * loss);
+        let total = trained.loss + trained.unevenness * EVENNESS;
         let gradients = Gradients::of(&total, self.model.network());
         let rate = self.schedule.rate(step);
         let gradient_norm = self
