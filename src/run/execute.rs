@@ -125,9 +125,9 @@ fn finish(
     state: State,
     failures: &mut Vec<RunError>,
 ) -> State {
-    let complete = schedule.to_do(&schedule.results(), cache).is_empty();
+    let complete = || schedule.to_do(&schedule.results(), cache).is_empty();
     let end = owned.end(state, failures.first().map(RunError::failure), complete);
-    let page = report::write(owned.directory());
+    let page = owned.alone(|| report::write(owned.directory()));
     // With the disk full, say so once; the record is as whole as the disk allows.
     if let (Err(error), true) = (end.and(page), failures.is_empty()) {
         failures.push(error);
@@ -135,7 +135,7 @@ fn finish(
     match state {
         State::Done if !failures.is_empty() => State::Failed,
         // This part is done; others of the run may not be.
-        State::Done if !complete => State::Queued,
+        State::Done if !complete() => State::Queued,
         state => state,
     }
 }

@@ -372,21 +372,25 @@ impl Owned {
             ended: None,
             error: None,
         };
-        self.update(false, |parts| {
-            if self.shard.count == 1 {
-                parts.clear();
-            }
-            parts.retain(|shard, _| shard.ends_with(&format!("/{}", self.shard.count)));
-            parts.insert(self.shard.to_string(), part);
-        })
+        self.update(
+            || false,
+            |parts| {
+                if self.shard.count == 1 {
+                    parts.clear();
+                }
+                parts.retain(|shard, _| shard.ends_with(&format!("/{}", self.shard.count)));
+                parts.insert(self.shard.to_string(), part);
+            },
+        )
     }
 
-    /// Marks the end of work. `complete` says whether every artifact of the run is there.
+    /// Marks the end of work. `complete` says whether every artifact of the run is there; it is asked when no other
+    /// shard can write its end, so that the last to write knows what all have made.
     pub fn end(
         &self,
         state: State,
         error: Option<Failure>,
-        complete: bool,
+        complete: impl FnOnce() -> bool,
     ) -> Result<(), RunError> {
         files::remove(&self.reserve())?;
         self.update(complete, |parts| {
@@ -403,22 +407,29 @@ impl Owned {
         self.directory.path.join(name)
     }
 
+    /// Does what no other shard of the run may do at the same time.
+    pub fn alone<T>(&self, action: impl FnOnce() -> Result<T, RunError>) -> Result<T, RunError> {
+        let never = Interrupt::default();
+        let _lock = Lock::wait(&self.directory.path.join(".lock-state"), &never, |_| {})?;
+        action()
+    }
+
     /// Changes `run.json` while no other shard does.
     fn update(
         &self,
-        complete: bool,
+        complete: impl FnOnce() -> bool,
         change: impl FnOnce(&mut BTreeMap<String, Part>),
     ) -> Result<(), RunError> {
-        let never = Interrupt::default();
-        let _lock = Lock::wait(&self.directory.path.join(".lock-state"), &never, |_| {})?;
-        let mut run = self.directory.read()?;
-        let before = run.state;
-        change(&mut run.parts);
-        run.state = overall(&run.parts, complete);
-        files::write_json(&self.directory.path.join("run.json"), &run)?;
-        if run.state != before || self.shard.count > 1 {
-            self.directory.announce(run.state, self.shard)?;
-        }
-        Ok(())
+        self.alone(|| {
+            let mut run = self.directory.read()?;
+            let before = run.state;
+            change(&mut run.parts);
+            run.state = overall(&run.parts, complete());
+            files::write_json(&self.directory.path.join("run.json"), &run)?;
+            if run.state != before || self.shard.count > 1 {
+                self.directory.announce(run.state, self.shard)?;
+            }
+            Ok(())
+        })
     }
 }

@@ -599,9 +599,31 @@ fn a_run_is_busy_while_a_shard_of_it_is_at_work() {
     let owned = directory.own("1/2".parse().unwrap()).unwrap();
     owned.begin().unwrap();
     assert!(directory.is_busy());
-    owned.end(State::Done, None, true).unwrap();
+    owned.end(State::Done, None, || true).unwrap();
     drop(owned);
     assert!(!directory.is_busy());
+}
+
+#[test]
+fn the_shard_that_writes_last_knows_what_the_others_made() {
+    let dir = tempfile::tempdir().unwrap();
+    let asked = experiment(vec![cell("", 0, json!({"steps": 2}), 1.0)]);
+    let directory = run(&asked, dir.path()).run;
+    let [first, second] = ["1/2", "2/2"].map(|shard| {
+        let owned = directory.own(shard.parse().unwrap()).unwrap();
+        owned.begin().unwrap();
+        owned
+    });
+    std::thread::scope(|scope| {
+        let unfinished = || {
+            // While the first looks, the second makes the rest; it must wait with its word until the first has spoken.
+            scope.spawn(|| second.end(State::Done, None, || true).unwrap());
+            std::thread::sleep(std::time::Duration::from_millis(50));
+            false
+        };
+        first.end(State::Done, None, unfinished).unwrap();
+    });
+    assert_eq!(directory.read().unwrap().state, State::Done);
 }
 
 #[test]
