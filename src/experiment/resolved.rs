@@ -1,43 +1,62 @@
-//! `resolved.yaml`: every value of a cell with the place it came from.
+//! `resolved.yaml`: every value of an experiment with the place it came from.
 
 use super::graph::{Cell, Experiment, Stage};
 use serde_json::Value;
+use std::collections::BTreeSet;
 use std::fmt::Write as _;
 
-/// The resolved stages of a cell as YAML, each value with `# from file:line`.
-pub fn to_yaml(experiment: &Experiment, cell: &Cell) -> String {
-    let mut text = String::new();
-    let _ = writeln!(text, "experiment: {}", scalar(&experiment.name));
-    if !cell.arm.is_empty() {
-        let _ = writeln!(text, "# arm {}", cell.arm);
-    }
-    let _ = writeln!(text, "seed: {}\nstages:", cell.seed);
-    for stage in &cell.graph.stages {
-        let _ = writeln!(text, "  {}:", scalar(&stage.name));
-        let _ = writeln!(text, "    op: {}", stage.op.name());
-        for edge in &stage.edges {
-            let names: Vec<String> = edge
-                .from
-                .iter()
-                .map(|&index| scalar(&cell.graph.stages[index].name))
-                .collect();
-            let value = if stage.traces.contains_key(&format!("{}.1", edge.port)) || names.len() > 1
-            {
-                format!("[{}]", names.join(", "))
-            } else {
-                names.join(", ")
-            };
-            line(
-                &mut text, experiment, stage, 4, edge.port, &value, edge.port,
-            );
+/// Every value of every cell, each with `# from file:line`: a YAML document per cell. The document of an experiment that is
+/// no sweep reads back as the same experiment; the cells of a sweep write a stage that they share once.
+pub fn to_yaml(experiment: &Experiment) -> String {
+    let mut text = String::from("# Every value, and where it was written.\n");
+    let mut seen = BTreeSet::new();
+    for cell in &experiment.cells {
+        if experiment.sweep {
+            let _ = writeln!(text, "---\n# cell {}", on_one_line(&cell.label()));
         }
-        if let Value::Object(map) = &stage.settings {
-            for (key, value) in map {
-                emit(&mut text, experiment, stage, 4, key, value, key);
+        let _ = writeln!(text, "experiment: {}", scalar(&experiment.name));
+        let _ = writeln!(text, "seed: {}\nstages:", cell.seed);
+        for stage in &cell.graph.stages {
+            let name = scalar(&stage.name);
+            let written = stage_to_yaml(experiment, cell, stage);
+            if seen.insert(format!("{name}\n{written}")) {
+                let _ = write!(text, "  {name}:\n{written}");
+            } else {
+                let _ = writeln!(text, "  {name}: {{}}  # as above");
             }
         }
-        if stage.op.seeded() {
-            let _ = writeln!(text, "    seed: {}", stage.seed);
+    }
+    text
+}
+
+fn stage_to_yaml(experiment: &Experiment, cell: &Cell, stage: &Stage) -> String {
+    let mut text = format!("    op: {}\n", stage.op.name());
+    for edge in &stage.edges {
+        let names: Vec<String> = edge
+            .from
+            .iter()
+            .map(|&index| scalar(&cell.graph.stages[index].name))
+            .collect();
+        let many = stage.traces.contains_key(&format!("{}.1", edge.port)) || names.len() > 1;
+        let value = if many {
+            format!("[{}]", names.join(", "))
+        } else {
+            names.concat()
+        };
+        line(
+            &mut text, experiment, stage, 4, edge.port, &value, edge.port,
+        );
+    }
+    if let Value::Object(map) = &stage.settings {
+        for (key, value) in map {
+            emit(&mut text, experiment, stage, 4, key, value, key);
+        }
+    }
+    if stage.op.seeded() {
+        let seed = stage.seed.to_string();
+        match stage.traces.get("seed") {
+            Some(_) => line(&mut text, experiment, stage, 4, "seed", &seed, "seed"),
+            None => _ = writeln!(text, "    seed: {seed}  # of the run"),
         }
     }
     text
@@ -73,11 +92,19 @@ fn line(
     value: &str,
     path: &str,
 ) {
-    let from = stage.traces.get(path).map_or_else(
+    // A list is written where its first item is.
+    let trace = stage.traces.get(path);
+    let trace = trace.or_else(|| stage.traces.get(&format!("{path}.0")));
+    let from = trace.map_or_else(
         || "default".to_owned(),
-        |trace| format!("from {}", experiment.sources.cite(trace.span)),
+        |trace| format!("from {}", on_one_line(&experiment.sources.cite(trace.span))),
     );
     let _ = writeln!(text, "{:indent$}{}: {value}  # {from}", "", scalar(key));
+}
+
+/// Text that ends no comment.
+fn on_one_line(text: &str) -> String {
+    text.replace(char::is_control, " ")
 }
 
 fn flow(value: &Value) -> String {

@@ -322,7 +322,7 @@ fn why_names_every_layer_that_had_a_say() {
 fn resolved_yaml_reads_back_as_the_same_experiment() {
     let folder = Folder::new(&[("tiny.yaml", TINY)]);
     let first = folder.sound("tiny.yaml", &["stages.mget.steps=12"]);
-    let text = reviv::experiment::resolved::to_yaml(&first, &first.cells[0]);
+    let text = reviv::experiment::resolved::to_yaml(&first);
     assert!(
         text.contains("steps: 12  # from --set stages.mget.steps=12"),
         "{text}"
