@@ -84,10 +84,7 @@ pub fn open(folder: &Path) -> Result<Recording, SourceError> {
 
     let eyes = folder.join("eyegaze.csv");
     if eyes.is_file() {
-        let large = vrs
-            .tags
-            .get("hardware_version")
-            .is_none_or(|version| version != "DVT-S");
+        let large = gaze::large_frame(&vrs.tags);
         recording.gaze = Some(aria_gaze(&eyes, large)?);
     }
     if let Some(skeleton) = skeleton_of(folder, vrs.tags.get("device_serial").map(String::as_str))?

@@ -7,6 +7,7 @@
 use super::SourceError;
 use super::adt::{VrsColour, aria_gaze};
 use super::aria::calibration::{self, unit_quaternion};
+use super::aria::gaze;
 use super::aria::trajectory::{self, Trajectory};
 use super::aria::vrs::image::Pictures;
 use super::aria::vrs::{StreamId, Vrs};
@@ -116,10 +117,7 @@ fn open_aria(folder: &Path, name: &str) -> Result<Recording, SourceError> {
             stream == StreamId::RGB || stream == StreamId::TIMECODE
         })?);
         clock = ClockMap::new(vrs.time_map(StreamId::TIMECODE)?);
-        large_frame = vrs
-            .tags
-            .get("hardware_version")
-            .is_some_and(|version| version == "DVT-L");
+        large_frame = gaze::large_frame(&vrs.tags);
         let pictures = Pictures::new(vrs, StreamId::RGB)?;
         side = pictures.size().map_or(1408, |(width, _)| width);
         let map = clock.as_ref().ok_or_else(|| {

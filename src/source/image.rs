@@ -55,6 +55,16 @@ impl Turn {
         }
     }
 
+    /// The turn that undoes this one.
+    #[must_use]
+    pub fn inverse(self) -> Self {
+        match self {
+            Turn::Clockwise => Turn::CounterClockwise,
+            Turn::CounterClockwise => Turn::Clockwise,
+            same => same,
+        }
+    }
+
     /// The size of the turned picture.
     #[must_use]
     pub fn size(self, width: u32, height: u32) -> (u32, u32) {

@@ -5,7 +5,7 @@ use super::SourceError;
 use super::adt::{VrsColour, aria_gaze};
 use super::aria::vrs::image::Pictures;
 use super::aria::vrs::{Kind, StreamId, Vrs};
-use super::aria::{calibration, hand_tracking, trajectory};
+use super::aria::{calibration, gaze, hand_tracking, trajectory};
 use super::dataset::{Recordings, find};
 use super::error::Place;
 use super::image::Turn;
@@ -108,10 +108,7 @@ pub fn open(folder: &Path) -> Result<Recording, SourceError> {
     let mut factory = None;
     if let Some(video) = container(folder)? {
         let vrs = Arc::new(Vrs::open_streams(&video, |stream| stream == StreamId::RGB)?);
-        large_frame = vrs
-            .tags
-            .get("hardware_version")
-            .is_some_and(|version| version == "DVT-L");
+        large_frame = gaze::large_frame(&vrs.tags);
         factory = vrs
             .tags
             .get("calib_json")

@@ -90,6 +90,10 @@ impl MountedCamera {
             T_device_camera: Isometry3::identity(),
         }
     }
+
+    fn has_lens(&self) -> bool {
+        self.camera != Self::without_lens().camera
+    }
 }
 
 /// One recording. Times are nanoseconds on one clock, whichever the adapter chose.
@@ -189,8 +193,8 @@ impl Recording {
     /// # Errors
     /// When pictures shall be undistorted whose lens is not known.
     pub fn check(&self, settings: &CutSettings) -> Result<(), SourceError> {
-        let lens = self.cameras.first().map(|(_, mounted)| &mounted.camera);
-        let known = lens.is_some_and(|lens| *lens != MountedCamera::without_lens().camera);
+        let camera = self.cameras.first().map(|(_, mounted)| mounted);
+        let known = camera.is_some_and(MountedCamera::has_lens);
         if settings.undistort.is_some() && self.colour.is_some() && !known {
             return Err(SourceError::Settings(format!(
                 "`undistort` needs a lens, and `{}/{}` has none",

@@ -9,6 +9,7 @@ use crate::source::csv::{Column, Row, Table};
 use crate::source::error::Place;
 use crate::source::track::{Blend, SECOND, Track};
 use nalgebra::{Isometry3, Point3, Quaternion, Translation3, UnitQuaternion, Vector3};
+use std::collections::BTreeMap;
 use std::path::Path;
 
 /// Gaze comes at 10 or 30 Hz; one lost row at 10 Hz is bridged.
@@ -46,6 +47,13 @@ impl Gaze {
         let direction = Vector3::new(self.yaw.tan(), self.pitch.tan(), 1.0).normalize();
         T_device_pupils * Point3::from(direction * distance)
     }
+}
+
+/// Whether the tags of a VRS file say that the glasses have the large frame; without the tag they count as small.
+#[must_use]
+pub fn large_frame(tags: &BTreeMap<String, String>) -> bool {
+    tags.get("hardware_version")
+        .is_some_and(|version| version == "DVT-L")
 }
 
 /// The central pupil frame on the device.

@@ -193,12 +193,7 @@ pub fn depth_square(metres: &Array2<f32>, turn: Turn, side: u32) -> Vec<f32> {
     let (turned_width, turned_height) = turn.size(width as u32, height as u32);
     let fit = SquareFit::new(turned_width, turned_height, side);
     let mut out = Vec::with_capacity(side as usize * side as usize);
-    // The turn that undoes `turn`.
-    let back = match turn {
-        Turn::Clockwise => Turn::CounterClockwise,
-        Turn::CounterClockwise => Turn::Clockwise,
-        other => other,
-    };
+    let back = turn.inverse();
     let scale = Vector2::new(
         f64::from(turned_width) / f64::from(fit.resized.0),
         f64::from(turned_height) / f64::from(fit.resized.1),

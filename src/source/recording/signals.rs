@@ -5,10 +5,10 @@ use super::{CutSettings, GAZE_RANGE, GazeSample, Recording};
 use crate::clip::clock::SIGNAL_RATE;
 use crate::clip::frames::WorldJoints;
 use crate::clip::{CameraTrack, GazeTrack, Intrinsics};
-use crate::geometry::camera::Lens;
+use crate::geometry::camera::{Camera, Lens};
 use crate::source::image::{SquareFit, Turn};
 use crate::source::track::{Joints, Track};
-use nalgebra::{Isometry3, Point3};
+use nalgebra::{Isometry3, Point3, Vector2, Vector3};
 use ndarray::{Array1, Array2};
 
 impl Recording {
@@ -17,32 +17,44 @@ impl Recording {
     #[must_use]
     pub fn gaze_at(&self, time: i64, settings: &CutSettings) -> Option<[f64; 2]> {
         let sample = self.gaze.as_ref()?.at(time)?;
-        let (u, v, width, height) = match sample {
+        let mounted = self.mounted(time);
+        let shown = |camera: &Camera| match settings.undistort {
+            Some(angle) => pinhole(camera, angle, camera.width.min(camera.height)),
+            None => camera.clone(),
+        };
+        // Where a direction in the camera falls in the upright picture, and that picture's size.
+        let project = |camera: &Camera, direction: &Vector3<f64>| {
+            let camera = shown(camera);
+            let pixel = camera.project(direction)?;
+            let (w, h) = (f64::from(camera.width), f64::from(camera.height));
+            let (width, height) = self.turn.size(camera.width, camera.height);
+            let pixel = self.turn.pixel(pixel.x, pixel.y, w, h);
+            Some((pixel, f64::from(width), f64::from(height)))
+        };
+        let ((u, v), width, height) = match sample {
             GazeSample::Pixel {
                 pixel: [u, v],
                 size: [width, height],
-            } => (u, v, width, height),
+            } => match mounted {
+                Some(mounted) if settings.undistort.is_some() && mounted.has_lens() => {
+                    let camera = &mounted.camera;
+                    let (w, h) = self.turn.size(camera.width, camera.height);
+                    let (w, h) = (f64::from(w), f64::from(h));
+                    let back = self.turn.inverse();
+                    let (u, v) = back.pixel(u * w / width, v * h / height, w, h);
+                    project(camera, &camera.unproject(&Vector2::new(u, v))?)?
+                }
+                _ => ((u, v), width, height),
+            },
             GazeSample::Aria(gaze, pupils) => {
-                let mounted = self.mounted(time)?;
+                let mounted = mounted?;
                 let distance = if settings.gaze_vergence && gaze.depth > 0.0 {
                     gaze.depth
                 } else {
                     settings.gaze_distance
                 };
                 let point = mounted.T_device_camera.inverse() * gaze.point(&pupils, distance);
-                let camera = match settings.undistort {
-                    Some(angle) => pinhole(
-                        &mounted.camera,
-                        angle,
-                        mounted.camera.width.min(mounted.camera.height),
-                    ),
-                    None => mounted.camera.clone(),
-                };
-                let pixel = camera.project(&point.coords)?;
-                let (w, h) = (f64::from(camera.width), f64::from(camera.height));
-                let (u, v) = self.turn.pixel(pixel.x, pixel.y, w, h);
-                let (width, height) = self.turn.size(camera.width, camera.height);
-                (u, v, f64::from(width), f64::from(height))
+                project(&mounted.camera, &point.coords)?
             }
         };
         let side = width.min(height);
@@ -149,4 +161,54 @@ pub(super) fn world_joints(track: &Track<Joints>, ticks: &[i64]) -> WorldJoints 
             None => vec![None::<Point3<f64>>; 21],
         })
         .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::camera::Pinhole;
+    use crate::source::recording::MountedCamera;
+
+    #[test]
+    fn a_gaze_pixel_goes_where_the_undistorted_picture_shows_it() {
+        let mut recording = Recording::new("mine", "one");
+        recording.turn = Turn::Clockwise;
+        let lens = Lens::Pinhole(Pinhole {
+            fx: 25.0,
+            fy: 25.0,
+            cx: 49.5,
+            cy: 49.5,
+        });
+        let camera = Camera {
+            lens,
+            width: 100,
+            height: 100,
+            valid_radius: None,
+        };
+        let T_device_camera = Isometry3::identity();
+        let mounted = MountedCamera {
+            camera,
+            T_device_camera,
+        };
+        recording.cameras = vec![(0, mounted)];
+        // Half as far right of the centre as in front of it, given in a picture of twice the camera's size.
+        let sample = GazeSample::Pixel {
+            pixel: [2.0 * (49.5 + 12.5), 2.0 * 49.5],
+            size: [200.0; 2],
+        };
+        recording.gaze = Some(Track::new(vec![(0, sample)], 1, 1));
+        let gaze = |undistort| {
+            let settings = CutSettings {
+                undistort,
+                ..CutSettings::default()
+            };
+            recording.gaze_at(0, &settings).unwrap()
+        };
+        assert_eq!(gaze(None), [0.62, 0.495]);
+        let [u, v] = gaze(Some(90.0));
+        assert!(
+            (u - 0.745).abs() < 1e-9 && (v - 0.495).abs() < 1e-9,
+            "{u} {v}"
+        );
+    }
 }
