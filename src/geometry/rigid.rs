@@ -1,7 +1,7 @@
 //! Rigid transforms (SE(3)): nalgebra's type and what it lacks.
 
 use super::rotation;
-use nalgebra::{Isometry3, Matrix3, Matrix4, Translation3};
+use nalgebra::{Isometry3, Matrix3, Matrix4, Rotation3, Translation3, UnitQuaternion};
 
 /// A rigid transform, `T_to_from`.
 pub type Rigid = Isometry3<f64>;
@@ -61,6 +61,17 @@ pub fn to_row_major(pose: &Rigid) -> [f64; 16] {
 /// `T_a_b` from `T_world_a` and `T_world_b`.
 pub fn relative(T_world_a: &Rigid, T_world_b: &Rigid) -> Rigid {
     T_world_a.inv_mul(T_world_b)
+}
+
+/// The pose of a camera that looks straight ahead: x right, y forward, z up, at the origin. What is assumed where gravity is
+/// not known.
+pub fn level_camera() -> Rigid {
+    let axes = Matrix3::new(1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, -1.0, 0.0);
+    let rotation = Rotation3::from_matrix_unchecked(axes);
+    Rigid::from_parts(
+        Translation3::identity(),
+        UnitQuaternion::from_rotation_matrix(&rotation),
+    )
 }
 
 /// Between two poses: linear in position, spherical in rotation.

@@ -1,8 +1,7 @@
 //! What is known of the camera before anything is decoded: its projection and where up is, given or assumed, and always said.
 
-use super::stitch::level_camera;
 use crate::clip::Intrinsics;
-use crate::geometry::rigid::Rigid;
+use crate::geometry::rigid::{Rigid, level_camera};
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};

@@ -56,7 +56,7 @@ pub struct Stitcher {
 }
 
 impl Stitcher {
-    /// `first` is the world pose of the video's first camera: [`level_camera`] where nothing better is known.
+    /// `first` is the world pose of the video's first camera: [`crate::geometry::rigid::level_camera`] where nothing better is known.
     pub fn new(first: Rigid) -> Self {
         Self {
             first,
@@ -177,17 +177,6 @@ impl Stitcher {
     }
 }
 
-/// The pose of a camera that looks straight ahead: x right, y forward, z up, at the origin. What is assumed where gravity is
-/// not known.
-pub fn level_camera() -> Rigid {
-    let axes = nalgebra::Matrix3::new(1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, -1.0, 0.0);
-    let rotation = nalgebra::Rotation3::from_matrix_unchecked(axes);
-    Rigid::from_parts(
-        Vector3::zeros().into(),
-        UnitQuaternion::from_rotation_matrix(&rotation),
-    )
-}
-
 /// The gravity frame of a camera (origin at its centre, x along the horizontal part of its right axis, z up) in the world.
 pub fn gravity_to_world(T_world_camera: &Rigid) -> Rigid {
     let right = T_world_camera.rotation * Vector3::x();
@@ -271,6 +260,7 @@ fn mean(values: impl Iterator<Item = f64>) -> Option<f64> {
 mod tests {
     use super::*;
     use crate::clip::CameraTrack;
+    use crate::geometry::rigid::level_camera;
     use crate::reconstruction::windows::windows;
     use ndarray::{Array2, Array3};
 

@@ -5,8 +5,8 @@ use super::canvas::{Canvas, Colour, LETTER, LINE, viridis};
 use super::contact::{LEFT, RIGHT};
 use crate::clip::frames::gravity_frame_of;
 use crate::clip::{CameraTrack, Clip, JointTrack};
+use crate::geometry::rigid::level_camera;
 use crate::geometry::skeleton::BODY;
-use crate::reconstruction::stitch::level_camera;
 use nalgebra::{Isometry3, Point3, Vector3};
 
 /// Side of one drawing.

@@ -5,12 +5,13 @@ use ndarray::{Array2, Array3, Array4, Ix3};
 use reviv::clip::{CameraTrack, Clip, Depth, GazeTrack, Intrinsics, JointTrack};
 use reviv::formats::npz::Npz;
 use reviv::geometry::rigid::Rigid;
+use reviv::geometry::rigid::level_camera;
 use reviv::geometry::skeleton::{BODY, JOINTS};
 use reviv::reconstruction::cloud::ray;
 use reviv::reconstruction::folder::{Folder, Setting, first_camera};
 use reviv::reconstruction::predictions::ScaleStatus;
 use reviv::reconstruction::scale::FloorFit;
-use reviv::reconstruction::stitch::{gravity_to_world, level_camera};
+use reviv::reconstruction::stitch::gravity_to_world;
 use reviv::reconstruction::windows::{samples_of, windows};
 use std::collections::BTreeMap;
 

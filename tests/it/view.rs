@@ -3,9 +3,9 @@
 use nalgebra::{Isometry3, UnitQuaternion, Vector3};
 use ndarray::{Array2, Array3};
 use reviv::clip::Intrinsics;
+use reviv::geometry::rigid::level_camera;
 use reviv::geometry::skeleton::JOINTS;
 use reviv::reconstruction::cloud::lift;
-use reviv::reconstruction::stitch::level_camera;
 use reviv::view::scene::Tone;
 use reviv::view::{Badge, Confidence, DepthGrids, Fact, Scene, Track, VideoFrames, write_page};
 use std::process::Command;

@@ -389,6 +389,7 @@ fn mean(values: &[f32]) -> f64 {
         known.iter().sum::<f64>() / known.len() as f64
     }
 }
+
 /// World pose of the first camera that puts a known first camera at the origin, heading along its right axis.
 pub fn first_camera(T_world_camera: &Rigid) -> Rigid {
     gravity_to_world(T_world_camera).inverse() * T_world_camera
