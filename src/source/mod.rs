@@ -10,8 +10,8 @@
 //! * one file per data set: [`adt`], [`hot3d`], [`mps`], [`neutral`] (the folder format that any data set can be written
 //!   as), [`egom2p`] (the ancestors' layout)
 //! * [`world`]: the built-in synthetic world
-//! * [`dataset`] (many recordings), [`mixture`] (many sources), [`open`] (whatever a path holds), [`split`] (for training, for the
-//!   test), [`convert`] into [`shards`], which are a source again, [`survey`] (a look at what is there)
+//! * [`dataset`] (many recordings), [`open`] (whatever a path holds), [`split`] (for training, for the test),
+//!   [`convert`] into [`shards`], which are a source again, [`survey`] (a look at what is there)
 //!
 //! A further data set is one file that fills a [`recording::Recording`], and one line in [`open::Dataset`].
 
@@ -27,7 +27,6 @@ pub mod egom2p;
 pub mod error;
 pub mod hot3d;
 pub mod image;
-pub mod mixture;
 pub mod mps;
 pub mod neutral;
 pub mod open;

@@ -1,6 +1,6 @@
 //! Every operation composed of the tensor library's own: what runs on GPU back ends, and what fused ones are tested against.
 
-use burn::tensor::{Int, Tensor, TensorData, activation};
+use burn::tensor::{Tensor, activation};
 
 use super::super::Segments;
 use super::{AdamWStep, FRAME_NORM_EPSILON, Taps, indices};
@@ -103,18 +103,15 @@ pub fn cross_entropy(logits: Tensor<2>, targets: &[u32]) -> Tensor<1> {
 
 pub fn convolve(x: Tensor<2>, weight: Tensor<2>, bias: Tensor<1>, taps: Taps) -> Tensor<2> {
     let ([rows, channels], outputs) = (x.dims(), weight.dims()[0]);
-    let device = x.device();
-    let sources: Vec<i64> = (0..taps.rows_out())
+    // A tap beside the picture reads the row of zeros behind the last.
+    let sources: Vec<u32> = (0..taps.rows_out())
         .flat_map(|row| {
-            (0..taps.count()).map(move |tap| taps.source(row, tap).unwrap_or(rows) as i64)
+            (0..taps.count()).map(move |tap| taps.source(row, tap).unwrap_or(rows) as u32)
         })
         .collect();
-    let length = sources.len();
-    let sources: Tensor<1, Int> = Tensor::from_data(
-        TensorData::new(sources, [length]),
-        &device.clone().without_autodiff(),
-    );
-    let padded = Tensor::cat(vec![x, Tensor::zeros([1, channels], &device)], 0);
+    let sources = indices(&sources, &x);
+    let nothing = Tensor::zeros([1, channels], &x.device());
+    let padded = Tensor::cat(vec![x, nothing], 0);
     let columns = padded
         .select(0, sources)
         .reshape([taps.rows_out(), taps.count() * channels]);
