@@ -92,9 +92,12 @@ fn line(
     value: &str,
     path: &str,
 ) {
-    // A list is written where its first item is.
-    let trace = stage.traces.get(path);
-    let trace = trace.or_else(|| stage.traces.get(&format!("{path}.0")));
+    let written = |path: &str| stage.traces.get(path);
+    let trace = written(path)
+        // A list is written where its first item is,
+        .or_else(|| written(&format!("{path}.0")))
+        // and the name of a registry entry may stand for all of it.
+        .or_else(|| path.strip_suffix(".use").and_then(written));
     let from = trace.map_or_else(
         || "default".to_owned(),
         |trace| format!("from {}", on_one_line(&experiment.sources.cite(trace.span))),

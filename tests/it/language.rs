@@ -328,6 +328,7 @@ fn resolved_yaml_reads_back_as_the_same_experiment() {
         "{text}"
     );
     assert!(text.contains("rate: 0.001  # default"), "{text}");
+    assert!(text.contains("use: dirichlet  # from tiny.yaml:"), "{text}");
     folder.write("again.yaml", text.as_bytes());
     let again = folder.sound("again.yaml", &[]);
     let stages = |experiment: &reviv::experiment::Experiment| -> Vec<serde_json::Value> {
