@@ -634,8 +634,8 @@ fn the_seed_of_a_stage_is_in_the_record() {
     let cells = vec![own, cell("b", 3, json!({"steps": 2}), 1.0)];
     let done = run(&experiment(cells), dir.path());
     let resolved = std::fs::read_to_string(done.run.path().join("resolved.yaml")).unwrap();
-    assert!(resolved.contains("    seed: 9\n"), "{resolved}");
-    assert!(resolved.contains("    seed: 3\n"), "{resolved}");
+    assert!(resolved.contains("    seed: 9  #"), "{resolved}");
+    assert!(resolved.contains("    seed: 3  #"), "{resolved}");
 }
 
 #[test]
