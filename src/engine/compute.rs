@@ -48,7 +48,7 @@ impl Compute {
     /// The device `choice` (`index` counts the devices of one kind), computing in `precision`.
     ///
     /// # Errors
-    /// When this build has no such device, or no operation computes in `precision`.
+    /// When this build or this machine has no such device, or no operation computes in `precision`.
     pub fn new(
         choice: DeviceChoice,
         index: usize,
@@ -80,35 +80,42 @@ impl Compute {
 }
 
 #[cfg(feature = "cuda")]
-#[allow(clippy::unnecessary_wraps)] // the same signature as without the feature
 fn cuda(index: usize) -> Result<Device, EngineError> {
-    Ok(Device::cuda(index))
+    use burn::tensor::DeviceType;
+    let mut found = Device::enumerate(DeviceType::Cuda).into_iter();
+    found.nth(index).ok_or_else(|| EngineError::NoSuchDevice {
+        device: format!("cuda:{index}"),
+        hint: "this machine has no such NVIDIA GPU, or no driver for it; `device: cpu` always works",
+    })
 }
 
 #[cfg(not(feature = "cuda"))]
 fn cuda(index: usize) -> Result<Device, EngineError> {
     Err(EngineError::NoSuchDevice {
         device: format!("cuda:{index}"),
-        hint: "build with `--features cuda`",
+        hint: "this program was built without NVIDIA GPUs; build with `--features cuda`",
     })
 }
 
-/// Index 0 is the best GPU there is, which may be an integrated one; others count discrete GPUs.
+/// Discrete GPUs come first. Programs that play a GPU on the processor do not count.
 #[cfg(feature = "vulkan")]
-#[allow(clippy::unnecessary_wraps)] // the same signature as without the feature
 fn vulkan(index: usize) -> Result<Device, EngineError> {
-    use burn::tensor::DeviceKind;
-    Ok(Device::vulkan(match index {
-        0 => DeviceKind::DefaultDevice,
-        index => DeviceKind::DiscreteGpu(index),
-    }))
+    use burn::tensor::{DeviceKind, DeviceType};
+    let software = Device::vulkan(DeviceKind::Cpu);
+    let mut found = Device::enumerate(DeviceType::Vulkan)
+        .into_iter()
+        .filter(|device| *device != software);
+    found.nth(index).ok_or_else(|| EngineError::NoSuchDevice {
+        device: format!("vulkan:{index}"),
+        hint: "this machine has no such GPU with a Vulkan driver; `device: cpu` always works",
+    })
 }
 
 #[cfg(not(feature = "vulkan"))]
 fn vulkan(index: usize) -> Result<Device, EngineError> {
     Err(EngineError::NoSuchDevice {
         device: format!("vulkan:{index}"),
-        hint: "build with `--features vulkan`",
+        hint: "this program was built without Vulkan; build with `--features vulkan`",
     })
 }
 
@@ -131,5 +138,20 @@ mod tests {
     fn a_missing_device_says_how_to_get_it() {
         let error = Compute::new(DeviceChoice::Cuda, 1, Precision::F32).unwrap_err();
         assert!(error.to_string().contains("--features cuda"), "{error}");
+    }
+
+    #[cfg(any(feature = "cuda", feature = "vulkan"))]
+    #[test]
+    fn a_gpu_that_the_machine_lacks_is_refused_before_anything_is_computed() {
+        let choices = [
+            #[cfg(feature = "cuda")]
+            DeviceChoice::Cuda,
+            #[cfg(feature = "vulkan")]
+            DeviceChoice::Vulkan,
+        ];
+        for choice in choices {
+            let error = Compute::new(choice, 99, Precision::F32).unwrap_err();
+            assert!(error.to_string().contains("no such"), "{error}");
+        }
     }
 }

@@ -31,7 +31,7 @@ pub use weights::{HostTensor, Values, Weights};
 /// Why the engine refuses.
 #[derive(Debug, thiserror::Error)]
 pub enum EngineError {
-    #[error("device `{device}` is not part of this build ({hint})")]
+    #[error("there is no device `{device}`: {hint}")]
     NoSuchDevice { device: String, hint: &'static str },
     #[error(
         "precision `{precision}` is not available on `{device}`: no operation computes in it yet; use `f32`"
