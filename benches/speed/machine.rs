@@ -39,10 +39,14 @@ pub fn header(threads: usize, rounds: usize, all: &[Results], compared: bool) ->
     } else {
         ""
     };
+    let rounds = match rounds {
+        1 => "one round".to_owned(),
+        rounds => format!("{rounds} rounds"),
+    };
     format!(
         "# Speed\n\n\
          {}, {threads} of {} cores used{memory}; {system}. {with}. {}.\n\n\
-         Seconds are the median and (least..most) of {rounds} rounds, in f32 on the CPU, each in a fresh process after one \
+         Seconds are the median and (least..most) of {rounds}, in f32 on the CPU, each in a fresh process after one \
          call to warm up.{ratio} Memory is the peak of the process.\n",
         environment.cpu,
         environment.cores,
