@@ -1,6 +1,7 @@
 //! `resolved.yaml`: every value of an experiment with the place it came from.
 
 use super::graph::{Cell, Experiment, Stage};
+use super::stage::Arity;
 use serde_json::Value;
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
@@ -37,7 +38,8 @@ fn stage_to_yaml(experiment: &Experiment, cell: &Cell, stage: &Stage) -> String 
             .iter()
             .map(|&index| scalar(&cell.graph.stages[index].name))
             .collect();
-        let many = stage.traces.contains_key(&format!("{}.1", edge.port)) || names.len() > 1;
+        let port = stage.op.inputs().iter().find(|port| port.name == edge.port);
+        let many = port.is_some_and(|port| matches!(port.arity, Arity::Many | Arity::Any));
         let value = if many {
             format!("[{}]", names.join(", "))
         } else {
@@ -72,6 +74,16 @@ fn emit(
     path: &str,
 ) {
     match value {
+        // What is nothing by default stays unwritten, for the eye alone.
+        value if is_nothing(value) && !stage.traces.contains_key(path) => {
+            let _ = writeln!(
+                text,
+                "{:indent$}# {}: {}  # default",
+                "",
+                scalar(key),
+                flow(value)
+            );
+        }
         Value::Object(map) if !map.is_empty() => {
             let _ = writeln!(text, "{:indent$}{}:", "", scalar(key));
             for (key, value) in map {
@@ -103,6 +115,15 @@ fn line(
         |trace| format!("from {}", on_one_line(&experiment.sources.cite(trace.span))),
     );
     let _ = writeln!(text, "{:indent$}{}: {value}  # {from}", "", scalar(key));
+}
+
+/// Null, or a map of nothing else.
+fn is_nothing(value: &Value) -> bool {
+    match value {
+        Value::Null => true,
+        Value::Object(map) => !map.is_empty() && map.values().all(is_nothing),
+        _ => false,
+    }
 }
 
 /// Text that ends no comment.

@@ -1,5 +1,9 @@
 //! The experiments that are shipped, through the binary: each checks and plans where its data are not, with the paper's numbers.
 
+use reviv::experiment::catalog::Catalog;
+use reviv::experiment::graph::Experiment;
+use reviv::experiment::load::{Request, load};
+use reviv::experiment::resolved;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -39,6 +43,35 @@ fn shipped() -> Vec<PathBuf> {
     }
     files.sort();
     files
+}
+
+#[test]
+fn what_a_run_resolves_reads_back_as_the_same_stages() {
+    let catalog = Catalog::linked();
+    let open = |path: &Path| {
+        let request = Request {
+            path: path.to_owned(),
+            set: Vec::new(),
+            seed: None,
+            data_may_be_absent: true,
+        };
+        let (experiment, report) = load(&catalog, &request);
+        experiment.unwrap_or_else(|| panic!("{}", report.render(false)))
+    };
+    let stages = |experiment: &Experiment| -> Vec<(String, Value, u64)> {
+        let stages = &experiment.cells[0].graph.stages;
+        stages
+            .iter()
+            .map(|stage| (stage.name.clone(), stage.settings.clone(), stage.seed))
+            .collect()
+    };
+    let folder = tempfile::tempdir().unwrap();
+    for name in ["quickstart", "tokenizers_small", "wearer"] {
+        let first = open(&root().join(format!("experiments/{name}.yaml")));
+        let again = folder.path().join("resolved.yaml");
+        std::fs::write(&again, resolved::to_yaml(&first)).unwrap();
+        assert_eq!(stages(&first), stages(&open(&again)), "{name}");
+    }
 }
 
 #[test]
