@@ -16,7 +16,7 @@ use reviv::decoding::reconstructor::{Reconstructor, Wish};
 use reviv::engine::Compute;
 use reviv::import::{Checkpoint, ImportOptions, import};
 use reviv::mget::Size;
-use reviv::source::world::{World, WorldSettings};
+use reviv::world::{World, WorldSettings};
 use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::process::Command;

@@ -5,13 +5,13 @@
 //! 200 MB/s or more.
 
 use reviv::clip::store::ClipSet;
-use reviv::source::aria::vrs::Vrs;
-use reviv::source::convert::{ConvertSettings, convert};
-use reviv::source::recording::CutSettings;
-use reviv::source::shards::TarSink;
-use reviv::source::video::{DecoderChoice, Video, VideoSettings, ffmpeg};
-use reviv::source::world::{World, WorldClips, WorldSettings};
-use reviv::source::{Source, mps};
+use reviv::datasets::aria::vrs::Vrs;
+use reviv::datasets::convert::{ConvertSettings, convert};
+use reviv::datasets::recording::CutSettings;
+use reviv::datasets::shards::TarSink;
+use reviv::datasets::{ClipSource, mps};
+use reviv::video::{DecoderChoice, Video, VideoSettings, ffmpeg};
+use reviv::world::{World, WorldClips, WorldSettings};
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 

@@ -1,6 +1,6 @@
 //! Seconds per world clip on one core, at the paper's size and at laptop size.
 
-use reviv::source::world::{World, WorldSettings};
+use reviv::world::{World, WorldSettings};
 use std::time::Instant;
 
 fn main() {

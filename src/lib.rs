@@ -8,7 +8,7 @@
 //! * the framework, which knows no model: [`experiment`], [`run`]
 //! * the science, which knows no YAML, no run directory and no terminal: [`training`], [`decoding`], [`reconstruction`],
 //!   [`evaluation`], [`view`], [`import`]; below them [`tokenizer`], [`mget`], [`masking`]; below them [`modality`],
-//!   [`clip`], [`source`]; and at the bottom [`nn`], [`engine`], [`geometry`], [`formats`], [`random`]
+//!   [`clip`], [`datasets`], [`world`], [`video`]; and at the bottom [`nn`], [`engine`], [`geometry`], [`formats`], [`random`]
 #![recursion_limit = "256"]
 // Transforms are named `T_to_from`, tensors carry shape suffixes (`x_BND`): the field's own notation.
 #![allow(non_snake_case)]
@@ -31,8 +31,10 @@ pub mod mget;
 pub mod tokenizer;
 
 pub mod clip;
+pub mod datasets;
 pub mod modality;
-pub mod source;
+pub mod video;
+pub mod world;
 
 pub mod engine;
 pub mod formats;

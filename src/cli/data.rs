@@ -6,15 +6,15 @@ mod synthesize;
 
 use super::run::{interruptible, progress};
 use super::terminal::{Failure, Terminal};
+use crate::datasets::convert::{ConvertSettings, Converted, convert};
+use crate::datasets::open::{Dataset, open};
+use crate::datasets::recording::CutSettings;
+use crate::datasets::shards::{Folder, Header};
+use crate::datasets::{ClipSource, ReadError};
 use crate::experiment::catalog::Catalog;
 use crate::experiment::load;
 use crate::experiment::registry::Registry;
 use crate::ops::clips::SourceSettings;
-use crate::source::convert::{ConvertSettings, Converted, convert};
-use crate::source::open::{Dataset, open};
-use crate::source::recording::CutSettings;
-use crate::source::shards::{Folder, Header};
-use crate::source::{Source, SourceError};
 use serde::Deserialize as _;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
@@ -117,9 +117,9 @@ fn source_entry(name: &str) -> Result<SourceSettings, Failure> {
 }
 
 /// The user's files are for the user to mend, the disk is not.
-fn failure(error: SourceError) -> Failure {
+fn failure(error: ReadError) -> Failure {
     match error {
-        SourceError::Io { .. } => Failure::machine(error),
+        ReadError::Io { .. } => Failure::machine(error),
         error => Failure::input(error.to_string(), ""),
     }
 }
@@ -127,7 +127,7 @@ fn failure(error: SourceError) -> Failure {
 /// Converts into a folder with progress; says what became of it.
 fn write(
     terminal: &Terminal,
-    source: &dyn Source,
+    source: &dyn ClipSource,
     request: serde_json::Value,
     settings: &ConvertSettings,
     output: &Path,

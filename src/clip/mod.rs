@@ -4,12 +4,13 @@
 //! carries its validity; a missing sample is invalid, never zero. Lengths are metres, angles radians, unless a name says else.
 //!
 //! [`clock`] says which samples make a clip, [`frames`] in which frame of reference they are, [`depth_video`] how depth becomes
-//! video, [`shard`] and [`store`] how clips and tokens lie on disk.
+//! video, [`source`] where clips come from, [`shard`] and [`store`] how clips and tokens lie on disk.
 
 pub mod clock;
 pub mod depth_video;
 pub mod frames;
 pub mod shard;
+pub mod source;
 pub mod statistics;
 pub mod store;
 

@@ -360,7 +360,7 @@ pub fn tokens_from_bytes(bytes: &[u8]) -> Result<(Vec<u32>, Vec<usize>), FormatE
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::source::world::{World, WorldSettings};
+    use crate::world::{World, WorldSettings};
 
     fn clips(count: u64) -> Vec<Clip> {
         let settings = WorldSettings {

@@ -2,12 +2,15 @@
 //!
 //! Read in this order: [`zip`] (archives, also the shell of npz and of released checkpoints), [`npy`] (one array), [`npz`]
 //! (named arrays), [`png`] (pictures). Every reader takes untrusted bytes: a malformed file is a [`FormatError`] that says
-//! where and why, and no length field is believed before it has been compared with the size of the file.
+//! where and why, a recording that cannot be read is a [`ReadError`], and no length field is believed before it has been compared with the size of the file.
 
 pub mod npy;
 pub mod npz;
 pub mod png;
+pub mod read_error;
 pub mod zip;
+
+pub use read_error::ReadError;
 
 use std::path::{Path, PathBuf};
 

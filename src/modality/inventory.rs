@@ -146,7 +146,7 @@ fn metres(depth: &crate::clip::Depth) -> Signal {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::source::world::{World, WorldSettings};
+    use crate::world::{World, WorldSettings};
 
     #[test]
     fn counts_do_not_depend_on_how_clips_are_grouped_and_say_what_is_missing() {

@@ -12,13 +12,13 @@ use settings::MARKERS;
 use splits::{deliver, parts, refused};
 
 use super::modality_entry::{self, DEFAULTS};
+use crate::datasets::convert::{ConvertSettings, convert};
+use crate::datasets::shards::TarSink;
 use crate::experiment::artifact::{ArtifactKind, Description, SignalFacts};
 use crate::experiment::context::{StageContext, StageError};
 use crate::experiment::problem::{Code, Problem};
 use crate::experiment::stage::{Inputs, Op, OpEntry, Port, StagePlan};
 use crate::modality::{self, Modality, Shape};
-use crate::source::convert::{ConvertSettings, convert};
-use crate::source::shards::TarSink;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::ops::ControlFlow;

@@ -7,7 +7,7 @@ use crate::experiment::{Code, Entry, Kind, KindEntry, Problem};
 use crate::modality::DeclaredSettings;
 use crate::modality::code;
 use crate::modality::declared::{Normalize, SignalSettings, SignalSource};
-use crate::source::world::clips::{SENSORS, sensor_of};
+use crate::world::clips::{SENSORS, sensor_of};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;

@@ -16,7 +16,7 @@ use crate::masking::PIXELS;
 use crate::reconstruction::lens::LensSettings;
 use crate::reconstruction::scale::FloorFit;
 use crate::reconstruction::windows::windows;
-use crate::source::video::VideoSettings;
+use crate::video::VideoSettings;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;

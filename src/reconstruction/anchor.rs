@@ -7,7 +7,7 @@
 use super::folder::thin;
 use crate::formats::FormatError;
 use crate::formats::npz::Npz;
-use crate::source::image::grey16_from_png;
+use crate::video::image::grey16_from_png;
 use ndarray::{Array2, Array3, ArrayView2, Axis, s};
 use std::path::{Path, PathBuf};
 

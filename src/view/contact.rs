@@ -4,7 +4,7 @@
 use super::canvas::{Canvas, Colour, LETTER, LINE, viridis};
 use crate::clip::{Clip, Intrinsics, JointTrack};
 use crate::geometry::skeleton::HAND;
-use crate::source::image::Image;
+use crate::video::image::Image;
 use ndarray::{Array1, Axis};
 
 /// Side of a frame, frames of a clip, and pixels between them.

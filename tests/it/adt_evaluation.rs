@@ -1,11 +1,11 @@
 //! The Aria Digital Twin sample through `op: clips` and `op: evaluate`, against arrays in the form that EgoM2P writes.
 
 use ndarray::{Array2, Array3};
+use reviv::datasets::recording::CutSettings;
+use reviv::datasets::{ClipSource as _, adt};
 use reviv::evaluation::scores::{ScoreSet, Scores};
 use reviv::evaluation::statistics::summarise;
 use reviv::formats::npz::Npz;
-use reviv::source::recording::CutSettings;
-use reviv::source::{Source as _, adt};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 

@@ -4,8 +4,8 @@
 use crate::readers_bad::{calibration_lines, hand};
 use crate::recordings_bad::{CONFIGURATION_LAYOUT, LAYOUT};
 use crate::vrs_writer::{CONFIGURATION, DATA, VrsWriter};
-use reviv::source::recording::CutSettings;
-use reviv::source::{Source, hot3d};
+use reviv::datasets::recording::CutSettings;
+use reviv::datasets::{ClipSource, hot3d};
 use std::fmt::Write as _;
 use std::path::Path;
 

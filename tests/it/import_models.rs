@@ -9,9 +9,9 @@ use reviv::engine::{Compute, Parameters, Weights};
 use reviv::import::{ImportOptions, import};
 use reviv::mget::names::to_release;
 use reviv::mget::{Mget, Size};
-use reviv::source::world::{World, WorldSettings};
 use reviv::tokenizer::trained::VqTokenizer;
 use reviv::tokenizer::{self, Tokenizer};
+use reviv::world::{World, WorldSettings};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 

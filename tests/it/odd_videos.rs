@@ -3,7 +3,7 @@
 
 use crate::reconstruct_command::Place;
 use crate::tiny_movie::{Movie, Picture};
-use reviv::source::video::{DecoderChoice, Video, VideoSettings};
+use reviv::video::{DecoderChoice, Video, VideoSettings};
 use std::path::PathBuf;
 
 struct Folder(tempfile::TempDir);

@@ -3,15 +3,15 @@
 
 use crate::vrs_writer::{CONFIGURATION, DATA, VrsWriter};
 use proptest::prelude::*;
+use reviv::datasets::aria::vrs::image::{Pictures, Pixels};
+use reviv::datasets::aria::vrs::{Kind, StreamId, Vrs};
+use reviv::datasets::aria::{gaze, hand_tracking, trajectory};
+use reviv::datasets::recording::CutSettings;
+use reviv::datasets::umetrack::HandProfile;
+use reviv::datasets::{ClipSource, Outcome, ReadError, adt, egom2p, neutral};
 use reviv::formats::npy::NpyArray;
 use reviv::formats::npz::Npz;
-use reviv::source::aria::vrs::image::{Pictures, Pixels};
-use reviv::source::aria::vrs::{Kind, StreamId, Vrs};
-use reviv::source::aria::{gaze, hand_tracking, trajectory};
-use reviv::source::recording::CutSettings;
-use reviv::source::umetrack::HandProfile;
-use reviv::source::video::Video;
-use reviv::source::{Outcome, Source, SourceError, adt, egom2p, neutral};
+use reviv::video::Video;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -70,9 +70,9 @@ fn small_vrs() -> VrsWriter {
 }
 
 /// Reads a table and says how many rows it has.
-type Reader = fn(&Path) -> Result<usize, SourceError>;
+type Reader = fn(&Path) -> Result<usize, ReadError>;
 
-fn read_all(path: &Path) -> Result<usize, SourceError> {
+fn read_all(path: &Path) -> Result<usize, ReadError> {
     let vrs = Arc::new(Vrs::open(path)?);
     let mut count = 0;
     for stream in [StreamId::RGB, StreamId::new(345, 2)] {
@@ -138,7 +138,7 @@ fn mutated(mut bytes: Vec<u8>, flips: &[(usize, u8)], keep: usize) -> Vec<u8> {
     bytes
 }
 
-fn error_names(path: &Path, error: &SourceError) -> bool {
+fn error_names(path: &Path, error: &ReadError) -> bool {
     error
         .to_string()
         .contains(&path.file_name().unwrap().to_string_lossy().into_owned())
@@ -171,8 +171,8 @@ proptest! {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("bad.mp4");
         std::fs::write(&path, mutated(bytes, &flips, keep + 300)).unwrap();
-        let settings = reviv::source::video::VideoSettings {
-            decoder: reviv::source::video::DecoderChoice::Embedded,
+        let settings = reviv::video::VideoSettings {
+            decoder: reviv::video::DecoderChoice::Embedded,
             ..Default::default()
         };
         match Video::open_with(&path, &settings) {
@@ -415,12 +415,12 @@ fn a_lens_that_is_unknown_or_of_another_size_a_slanted_turn_and_empty_depth_are_
 
 #[test]
 fn a_recording_that_lacks_a_part_is_an_error_and_not_another_kind() {
-    let look = |folder: &Path| match reviv::source::open::open(folder, None, &small(), &[]) {
+    let look = |folder: &Path| match reviv::datasets::open::open(folder, None, &small(), &[]) {
         Ok(source) => panic!("opened as `{}`", source.name()),
         Err(error) => error,
     };
     let nothing = tempfile::tempdir().unwrap();
-    assert!(matches!(look(nothing.path()), SourceError::Absent { .. }));
+    assert!(matches!(look(nothing.path()), ReadError::Absent { .. }));
     // A neutral recording whose pictures are not there.
     let folder = tempfile::tempdir().unwrap();
     neutral_folder(folder.path(), 30.0, 0.0);
@@ -429,7 +429,7 @@ fn a_recording_that_lacks_a_part_is_an_error_and_not_another_kind() {
     let text = std::fs::read_to_string(&path).unwrap();
     std::fs::write(&path, text.replace("rgb.mp4", "frames")).unwrap();
     let error = look(folder.path());
-    assert!(matches!(error, SourceError::Missing { .. }), "{error}");
+    assert!(matches!(error, ReadError::Missing { .. }), "{error}");
     // An ADT sequence without its factory calibration.
     let folder = tempfile::tempdir().unwrap();
     let vrs = small_vrs().finish(true, true);

@@ -6,11 +6,11 @@ use crate::shared;
 use nalgebra::{Isometry3, Matrix4, Rotation3, UnitQuaternion, Vector3};
 use reviv::clip::Clip;
 use reviv::clip::frames::gravity_frame;
+use reviv::datasets::recording::{CutSettings, Recording};
+use reviv::datasets::{ClipSource, Outcome, adt, hot3d, mps};
 use reviv::formats::npz::Npz;
 use reviv::geometry::skeleton::HAND_FROM_COMMON;
-use reviv::source::image::Turn;
-use reviv::source::recording::{CutSettings, Recording};
-use reviv::source::{Outcome, Source, adt, hot3d, mps};
+use reviv::video::image::Turn;
 use std::path::PathBuf;
 
 fn data(name: &str) -> Option<PathBuf> {
@@ -38,7 +38,7 @@ fn short() -> CutSettings {
     }
 }
 
-fn only_clip(source: &impl Source) -> Clip {
+fn only_clip(source: &impl ClipSource) -> Clip {
     assert_eq!(source.len(), 1);
     source.clip(0).unwrap().into_clip().expect("not dropped")
 }
@@ -397,7 +397,7 @@ fn every_gaze_table_of_the_samples_is_read() {
         ),
     ] {
         assert_eq!(
-            reviv::source::aria::gaze::read(&root.join(name))
+            reviv::datasets::aria::gaze::read(&root.join(name))
                 .unwrap()
                 .times()
                 .len(),
@@ -405,7 +405,7 @@ fn every_gaze_table_of_the_samples_is_read() {
             "{name}"
         );
     }
-    let [left, right] = reviv::source::aria::hand_tracking::read(
+    let [left, right] = reviv::datasets::aria::hand_tracking::read(
         &root.join("mps_sample/hand_tracking/hand_tracking_results_v1.csv"),
     )
     .unwrap();

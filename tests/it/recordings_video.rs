@@ -1,9 +1,9 @@
 //! Videos: the embedded decoder against ffmpeg's pixels, seeking, frame choice, what is beyond it, damage.
 
 use crate::shared;
-use reviv::source::SourceError;
-use reviv::source::image::Image;
-use reviv::source::video::{DecoderChoice, Video, VideoSettings, embedded, ffmpeg, h264, mp4};
+use reviv::formats::ReadError;
+use reviv::video::image::Image;
+use reviv::video::{DecoderChoice, Video, VideoSettings, embedded, ffmpeg, h264, mp4};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -96,7 +96,7 @@ fn four_four_four_goes_through_ffmpeg_and_equals_its_pngs() {
             ..VideoSettings::default()
         },
     );
-    let Err(SourceError::Unsupported { reason, .. }) = refused else {
+    let Err(ReadError::Unsupported { reason, .. }) = refused else {
         panic!("4:4:4 must be refused by the embedded decoder: {refused:?}")
     };
     assert!(reason.contains("4:4:4"), "{reason}");

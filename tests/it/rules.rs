@@ -16,7 +16,8 @@ const FLOORS: &[&[&str]] = &[
         "import",
     ],
     &["tokenizer", "mget", "masking"],
-    &["modality", "clip", "source"],
+    &["datasets", "world"],
+    &["modality", "clip", "video"],
     &["nn", "engine", "geometry", "formats", "random"],
 ];
 

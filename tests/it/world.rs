@@ -3,8 +3,8 @@
 use nalgebra::{Isometry3, Point3};
 use reviv::clip::{Clip, Intrinsics, JointTrack, clock};
 use reviv::geometry::skeleton::{BODY, HAND, JOINTS, Skeleton};
-use reviv::source::world::render::Part;
-use reviv::source::world::{HandValidity, World, WorldSettings};
+use reviv::world::render::Part;
+use reviv::world::{HandValidity, World, WorldSettings};
 
 fn world(size: u32) -> World {
     let settings = WorldSettings {

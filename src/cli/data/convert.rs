@@ -2,7 +2,7 @@
 
 use super::super::terminal::{Failure, Terminal};
 use super::{Cut, absolute, write};
-use crate::source::convert::ConvertSettings;
+use crate::datasets::convert::ConvertSettings;
 use serde_json::json;
 use std::path::PathBuf;
 

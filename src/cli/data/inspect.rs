@@ -3,13 +3,13 @@
 use super::super::run::{interruptible, progress};
 use super::super::terminal::{Failure, Terminal};
 use super::{Cut, failure, source_entry};
+use crate::datasets::Source;
+use crate::datasets::survey::{Survey, survey};
 use crate::formats::png;
 use crate::modality::inventory::Row;
-use crate::source::Source;
-use crate::source::survey::{Survey, survey};
-use crate::source::world::{World, WorldClips};
 use crate::view::contact::contact_sheet;
 use crate::view::paths::paths;
+use crate::world::{World, WorldClips};
 use serde_json::json;
 use std::fmt::Write as _;
 use std::ops::ControlFlow;
@@ -140,7 +140,7 @@ fn pictures(found: &Survey, output: &Path) -> Result<Vec<PathBuf>, Failure> {
     Ok(files)
 }
 
-fn words(found: &Survey, source: &dyn Source) -> String {
+fn words(found: &Survey, source: &dyn ClipSource) -> String {
     let mut text = format!(
         "{}: {} clips in {} recordings; looked at {}\n",
         found.source, found.clips, found.recordings, found.looked_at

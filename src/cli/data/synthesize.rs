@@ -2,8 +2,8 @@
 
 use super::super::terminal::{Failure, Terminal};
 use super::{source_entry, write};
-use crate::source::convert::ConvertSettings;
-use crate::source::world::{World, WorldClips};
+use crate::datasets::convert::ConvertSettings;
+use crate::world::{World, WorldClips};
 use serde_json::json;
 use std::path::PathBuf;
 

@@ -1,13 +1,13 @@
 //! What an experiment says of its clips.
 
 use crate::clip::depth_video::DepthCoding;
+use crate::datasets::open::Dataset;
+use crate::datasets::recording::CutSettings;
+use crate::datasets::split::SplitSettings;
 use crate::experiment::entry::{Entry, Kind, KindEntry};
 use crate::modality::ClipFormat;
 use crate::ops::modality_entry::{self, Defaults, ModalityEntry};
-use crate::source::open::Dataset;
-use crate::source::recording::CutSettings;
-use crate::source::split::SplitSettings;
-use crate::source::world::WorldSettings;
+use crate::world::WorldSettings;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 

@@ -1,15 +1,15 @@
 //! Which clips go into which split, and the move to where the artifact is.
 
 use super::settings::{ClipsSettings, MARKERS};
+use crate::datasets::coded::Coded;
+use crate::datasets::open::open;
+use crate::datasets::split::{Chosen, divide};
+use crate::datasets::{ClipSource, ReadError};
 use crate::experiment::context::{StageContext, StageError};
 use crate::experiment::problem::Code;
 use crate::modality::ClipFormat;
-use crate::source::coded::Coded;
-use crate::source::open::open;
-use crate::source::split::{Chosen, divide};
-use crate::source::world::World;
-use crate::source::world::clips::WorldClips;
-use crate::source::{Source, SourceError};
+use crate::world::World;
+use crate::world::clips::WorldClips;
 use std::path::Path;
 use std::sync::Arc;
 
@@ -79,9 +79,9 @@ pub(super) fn parts(
 }
 
 /// What is wrong with recordings is for the user to mend, what is wrong with the disk is not.
-pub(super) fn refused(error: SourceError) -> StageError {
+pub(super) fn refused(error: ReadError) -> StageError {
     match error {
-        SourceError::Io { path, cause } => StageError::Io {
+        ReadError::Io { path, cause } => StageError::Io {
             path: path.display().to_string(),
             error: cause,
         },

@@ -4,13 +4,13 @@ use super::ReconstructSettings;
 use crate::clip::store::ClipSet;
 use crate::clip::{Clip, Intrinsics, Rgb};
 use crate::experiment::{Code, InputArtifact, StageError};
+use crate::formats::ReadError;
 use crate::geometry::rigid::Rigid;
 use crate::modality::ClipFormat;
 use crate::reconstruction::lens::{LensError, LensSettings};
 use crate::reconstruction::windows::Window;
-use crate::source::SourceError;
-use crate::source::image::Image;
-use crate::source::video::{self, Video};
+use crate::video::image::Image;
+use crate::video::{self, Video};
 use crate::view::Fact;
 use crate::view::scene::{Badge, Tone};
 use ndarray::Array4;
@@ -324,7 +324,7 @@ pub(super) fn input(message: impl Display, help: &str) -> StageError {
     }
 }
 
-fn unreadable(error: &SourceError) -> StageError {
+fn unreadable(error: &ReadError) -> StageError {
     input(error, "check the file, or convert it with `ffmpeg`")
 }
 

@@ -1,0 +1,217 @@
+//! Many recordings as one [`Source`]: opened when needed, a few of them kept open.
+
+use super::declared::DeclaredTrack;
+use super::recording::{CutSettings, Recording};
+use super::{ClipSource, Outcome, ReadError};
+use crate::modality::{BUILT_IN, ClipFormat, DeclaredSettings};
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, OnceLock};
+
+/// Opens one recording of a data set.
+pub type Open = fn(&Path, &CutSettings) -> Result<Recording, ReadError>;
+
+/// An open recording with its declared signals, or room for one.
+type Slot = Arc<OnceLock<Arc<(Recording, Vec<DeclaredTrack>)>>>;
+
+/// Recordings of one data set.
+pub struct Recordings {
+    name: String,
+    settings: CutSettings,
+    open: Open,
+    folders: Vec<PathBuf>,
+    /// First clip of every recording, and the number of all clips at the end.
+    starts: Vec<usize>,
+    names: Vec<String>,
+    modalities: Vec<String>,
+    /// Modalities that a file of each folder brings.
+    declared: Vec<DeclaredSettings>,
+    /// The recordings used last, the newest at the end.
+    recent: Mutex<Vec<(usize, Slot)>>,
+    keep: usize,
+}
+
+impl std::fmt::Debug for Recordings {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Recordings")
+            .field("name", &self.name)
+            .field("folders", &self.folders)
+            .field("starts", &self.starts)
+            .finish_non_exhaustive()
+    }
+}
+
+impl Recordings {
+    /// Opens every folder once to count its clips.
+    ///
+    /// # Errors
+    /// When settings make no sense, or a recording cannot be opened.
+    pub fn new(
+        name: &str,
+        folders: Vec<PathBuf>,
+        settings: CutSettings,
+        open: Open,
+    ) -> Result<Self, ReadError> {
+        settings.check()?;
+        let mut starts = vec![0];
+        let (mut modalities, mut names): (Vec<String>, Vec<String>) = Default::default();
+        for folder in &folders {
+            let recording = open(folder, &settings)?;
+            recording.check(&settings)?;
+            starts.push(starts[starts.len() - 1] + recording.clips(&settings));
+            names.push(recording.id.clone());
+            for modality in recording.modalities() {
+                if !modalities.contains(&modality) {
+                    modalities.push(modality);
+                }
+            }
+        }
+        modalities.sort_by_key(|name| BUILT_IN.iter().position(|known| known == name));
+        Ok(Recordings {
+            name: name.to_owned(),
+            settings,
+            open,
+            folders,
+            starts,
+            names,
+            modalities,
+            declared: Vec::new(),
+            recent: Mutex::new(Vec::new()),
+            keep: rayon::current_num_threads() + 1,
+        })
+    }
+
+    /// Gives the clips these modalities too, from the npz file of each recording that a declaration names.
+    #[must_use]
+    pub fn with_declared(mut self, declared: &[DeclaredSettings]) -> Self {
+        self.declared = declared.to_vec();
+        self
+    }
+
+    /// The folders, in the order of their clips.
+    #[must_use]
+    pub fn folders(&self) -> &[PathBuf] {
+        &self.folders
+    }
+
+    fn recording(&self, number: usize) -> Result<Arc<(Recording, Vec<DeclaredTrack>)>, ReadError> {
+        let slot = {
+            let mut recent = self
+                .recent
+                .lock()
+                .unwrap_or_else(std::sync::PoisonError::into_inner);
+            let slot = match recent.iter().position(|(known, _)| *known == number) {
+                Some(at) => recent.remove(at).1,
+                None => Arc::default(),
+            };
+            recent.push((number, Arc::clone(&slot)));
+            let surplus = recent.len().saturating_sub(self.keep);
+            recent.drain(..surplus);
+            slot
+        };
+        if let Some(recording) = slot.get() {
+            return Ok(Arc::clone(recording));
+        }
+        // Two threads may open the same recording at the same time; one of the two results is kept.
+        let folder = &self.folders[number];
+        let tracks: Result<Vec<_>, _> = self
+            .declared
+            .iter()
+            .filter_map(|settings| DeclaredTrack::read(folder, settings).transpose())
+            .collect();
+        let opened = Arc::new(((self.open)(folder, &self.settings)?, tracks?));
+        Ok(Arc::clone(slot.get_or_init(|| opened)))
+    }
+}
+
+impl ClipSource for Recordings {
+    fn name(&self) -> &str {
+        &self.name
+    }
+
+    fn len(&self) -> usize {
+        self.starts[self.folders.len()]
+    }
+
+    fn modalities(&self) -> Vec<String> {
+        self.modalities.clone()
+    }
+
+    fn format(&self) -> Option<ClipFormat> {
+        Some(ClipFormat {
+            declared: self.declared.clone(),
+            ..self.settings.format()
+        })
+    }
+
+    fn recordings(&self) -> Vec<(String, Range<usize>)> {
+        let ranges = self.starts.windows(2).map(|pair| pair[0]..pair[1]);
+        self.names.iter().cloned().zip(ranges).collect()
+    }
+
+    fn clip(&self, index: usize) -> Result<Outcome, ReadError> {
+        if index >= self.len() {
+            return Err(ReadError::OutOfRange {
+                source_name: self.name.clone(),
+                index,
+                len: self.len(),
+            });
+        }
+        let number = self.starts.partition_point(|start| *start <= index) - 1;
+        let (recording, declared) = &*self.recording(number)?;
+        let inside = index - self.starts[number];
+        let mut outcome = recording.clip(inside, &self.settings)?;
+        if let Outcome::Clip(clip) = &mut outcome {
+            for track in declared {
+                let signal = track.clip(inside as f64 * self.settings.stride);
+                clip.declared.insert(track.name.clone(), signal);
+            }
+        }
+        Ok(outcome)
+    }
+}
+
+/// The folders below `root` (itself included) that `is_recording` accepts, in the order of their names; recordings are not
+/// looked for inside recordings.
+///
+/// # Errors
+/// When a folder cannot be listed, or there is none.
+pub fn find(
+    root: &Path,
+    what: &str,
+    is_recording: fn(&Path) -> bool,
+) -> Result<Vec<PathBuf>, ReadError> {
+    fn descend(
+        folder: &Path,
+        depth: usize,
+        is_recording: fn(&Path) -> bool,
+        found: &mut Vec<PathBuf>,
+    ) -> Result<(), ReadError> {
+        if is_recording(folder) {
+            found.push(folder.to_owned());
+            return Ok(());
+        }
+        if depth == 0 {
+            return Ok(());
+        }
+        let fail = |cause| ReadError::io(folder, cause);
+        let mut inside = Vec::new();
+        for entry in std::fs::read_dir(folder).map_err(fail)? {
+            let entry = entry.map_err(fail)?;
+            // Links are not followed: a link to a parent would never end.
+            if entry.file_type().map_err(fail)?.is_dir() {
+                inside.push(entry.path());
+            }
+        }
+        inside.sort();
+        inside
+            .iter()
+            .try_for_each(|path| descend(path, depth - 1, is_recording, found))
+    }
+    let mut found = Vec::new();
+    descend(root, 4, is_recording, &mut found)?;
+    if found.is_empty() {
+        return Err(ReadError::absent(root, format!("there is no {what} here")));
+    }
+    Ok(found)
+}

@@ -1,0 +1,37 @@
+//! Where clips come from: recordings and data sets (Sec. 3, Table 1).
+//!
+//! Everything is a [`ClipSource`]: a named list of clips that are made when they are asked for, by index, from any thread. Read in
+//! this order:
+//!
+//! * [`recording`]: how a recording is cut into clips, once for all data sets; [`track`]: signals with clocks of their own
+//! * [`aria`]: recordings of Project Aria glasses; [`umetrack`]: hands from joint angles
+//! * one file per data set: [`adt`], [`hot3d`], [`mps`], [`neutral`] (the folder format that any data set can be written
+//!   as), [`egom2p`] (the ancestors' layout)
+//! * [`dataset`] (many recordings), [`open`] (whatever a path holds), [`split`] (for training, for the test),
+//!   [`convert`] into [`shards`], which are a source again, [`survey`] (a look at what is there)
+//!
+//! A further data set is one file that fills a [`recording::Recording`], and one line in [`open::Dataset`].
+
+pub mod adt;
+pub mod aria;
+pub mod coded;
+pub mod convert;
+pub mod csv;
+pub mod cut;
+pub mod dataset;
+mod declared;
+pub mod egom2p;
+pub mod hot3d;
+pub mod mps;
+pub mod neutral;
+pub mod open;
+mod pipeline;
+pub mod recording;
+pub mod shards;
+pub mod split;
+pub mod survey;
+pub mod track;
+pub mod umetrack;
+
+pub use crate::clip::source::{ClipSource, Clips, DropReason, Outcome, clips};
+pub use crate::formats::ReadError;

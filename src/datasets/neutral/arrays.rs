@@ -1,0 +1,184 @@
+//! Arrays of a recording: values, the times of their rows, poses and joints.
+
+use super::FILE;
+use super::manifest::{CameraEntry, Direction, JointEntry};
+use crate::datasets::track::{Joints, SECOND, Track};
+use crate::formats::ReadError;
+use crate::formats::npy::{self, NpyArray};
+use crate::formats::npz::Npz;
+use crate::formats::read_error::Position;
+use nalgebra::{Isometry3, Matrix3, Point3, Rotation3, UnitQuaternion, Vector3};
+use std::path::Path;
+
+pub(super) fn nanoseconds(path: &Path, seconds: f64) -> Result<i64, ReadError> {
+    // A century on either side.
+    if seconds.abs() < 3.2e9 {
+        Ok((seconds * SECOND as f64).round() as i64)
+    } else {
+        Err(ReadError::malformed(
+            path,
+            Position::File,
+            format!("a time of {seconds} seconds"),
+        ))
+    }
+}
+
+pub(super) fn array(path: &Path, key: Option<&str>) -> Result<NpyArray, ReadError> {
+    if path.extension().is_some_and(|extension| extension == "npy") {
+        return Ok(npy::read(path)?);
+    }
+    let key = key.unwrap_or("arr_0");
+    let mut npz = Npz::read_some(path, &[key])?;
+    npz.arrays
+        .remove(key)
+        .ok_or_else(|| ReadError::missing(path, format!("there is no array `{key}`")))
+}
+
+/// An array and the times of its rows.
+pub(super) fn load(
+    root: &Path,
+    file: &Path,
+    key: Option<&str>,
+    start: f64,
+    rate: Option<f64>,
+    times: Option<&str>,
+) -> Result<(NpyArray, Vec<i64>), ReadError> {
+    let path = root.join(file);
+    let values = array(&path, key)?;
+    let count = values.shape.first().copied().unwrap_or(0);
+    if count == 0 {
+        return Err(ReadError::malformed(
+            &path,
+            Position::File,
+            "the array has no rows",
+        ));
+    }
+    let times: Vec<i64> = match (times, rate) {
+        (Some(times), _) => array(&path, Some(times))?
+            .to::<f64>()?
+            .iter()
+            .map(|seconds| nanoseconds(&path, *seconds))
+            .collect::<Result<_, _>>()?,
+        (None, Some(rate)) if rate > 0.0 && rate.is_finite() => (0..count)
+            .map(|k| nanoseconds(&path, start + k as f64 / rate))
+            .collect::<Result<_, _>>()?,
+        _ => {
+            return Err(ReadError::malformed(
+                &root.join(FILE),
+                Position::File,
+                format!(
+                    "`{}` needs a `rate` or the name of an array of `times`",
+                    file.display()
+                ),
+            ));
+        }
+    };
+    if times.len() != count || !times.is_sorted() {
+        return Err(ReadError::malformed(
+            &path,
+            Position::File,
+            format!(
+                "{} times for {count} rows, or they do not ascend",
+                times.len()
+            ),
+        ));
+    }
+    Ok((values, times))
+}
+
+pub(super) fn shape(path: &Path, found: &[usize], wanted: &[usize]) -> Result<(), ReadError> {
+    if found == wanted {
+        return Ok(());
+    }
+    Err(ReadError::malformed(
+        path,
+        Position::File,
+        format!("an array of shape {found:?} instead of {wanted:?}"),
+    ))
+}
+
+/// Gaps and holds that fit the spacing of the samples.
+pub(super) fn track<T: crate::datasets::track::Blend>(
+    samples: Vec<(i64, T)>,
+    times: &[i64],
+) -> Track<T> {
+    let period = (times[times.len() - 1] - times[0]) / (times.len() as i64 - 1).max(1);
+    Track::new(samples, period * 5 / 2 + 1, period * 3 / 5 + 1)
+}
+
+pub(super) fn poses(
+    path: &Path,
+    array: &NpyArray,
+    entry: &CameraEntry,
+) -> Result<Vec<Option<Isometry3<f64>>>, ReadError> {
+    let matrices = array.to_dim::<f64, ndarray::Ix3>()?;
+    let rows = matrices.shape()[1];
+    shape(
+        path,
+        &matrices.shape()[1..],
+        &[if rows == 3 { 3 } else { 4 }, 4],
+    )?;
+    matrices
+        .outer_iter()
+        .enumerate()
+        .map(|(index, m)| {
+            if m.iter().any(|v| !v.is_finite()) {
+                return Ok(None);
+            }
+            let rotation = Matrix3::from_fn(|r, c| m[[r, c]]);
+            if (rotation * rotation.transpose() - Matrix3::identity()).norm() > 1e-2
+                || rotation.determinant() < 0.0
+            {
+                return Err(ReadError::malformed(
+                    path,
+                    Position::Frame(index as u64),
+                    "the pose is no rotation",
+                ));
+            }
+            let pose = Isometry3::from_parts(
+                Vector3::new(m[[0, 3]], m[[1, 3]], m[[2, 3]]).into(),
+                UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix(&rotation)),
+            );
+            let pose = match entry.direction {
+                Direction::CameraToWorld => pose,
+                Direction::WorldToCamera => pose.inverse(),
+            };
+            let axes = Rotation3::from_matrix_unchecked(entry.axes.opencv_in());
+            Ok(Some(pose * UnitQuaternion::from_rotation_matrix(&axes)))
+        })
+        .collect()
+}
+
+pub(super) fn joints(
+    root: &Path,
+    entry: &JointEntry,
+) -> Result<(Track<Joints>, Vec<i64>), ReadError> {
+    let (array, times) = load(
+        root,
+        &entry.file,
+        entry.key.as_deref(),
+        entry.start,
+        entry.rate,
+        entry.times.as_deref(),
+    )?;
+    let values = array.to_dim::<f64, ndarray::Ix3>()?;
+    let (map, count) = entry.order.map();
+    shape(
+        &root.join(&entry.file),
+        values.shape(),
+        &[times.len(), count, 3],
+    )?;
+    let scale = entry.unit.metres();
+    let samples = times
+        .iter()
+        .zip(values.outer_iter())
+        .map(|(time, row)| {
+            let joints = map.map(|joint| {
+                let p = Point3::new(row[[joint, 0]], row[[joint, 1]], row[[joint, 2]]) * scale;
+                p.iter().all(|v| v.is_finite()).then_some(p)
+            });
+            (*time, joints)
+        })
+        .collect();
+    Ok((track(samples, &times), times))
+}

@@ -1,0 +1,379 @@
+//! One recording of a head-mounted camera, whatever made it, and how it is cut into clips of two seconds.
+//!
+//! An adapter (one file per data set) fills a [`Recording`]: pictures that are read when they are needed, and small tables that
+//! are held. Everything else happens here, once for all data sets: the two clocks of a clip, the quarter turn of Aria's and
+//! Quest's pictures, the fit to a square, projection of gaze, hands in the camera, the body in the gravity frame, and the rule
+//! that colour and depth belong together only within 10 ms.
+
+mod pictures;
+mod signals;
+
+pub use super::cut::CutSettings;
+pub use pictures::depth_square;
+
+use signals::world_joints;
+
+use super::ReadError;
+use super::track::{Joints, SECOND, Track, nearest};
+use super::{DropReason, Outcome};
+use crate::clip::clock::{CLIP_SECONDS, SIGNAL_RATE, SIGNAL_SAMPLES};
+use crate::clip::frames::{gravity_frame_of, joints_in_camera, joints_in_frame};
+use crate::clip::{Clip, JointTrack};
+use crate::geometry::camera::{Camera, KannalaBrandt, Lens};
+use crate::geometry::undistortion::Remap;
+use crate::video::image::{Image, Turn};
+use nalgebra::{Isometry3, Rotation3, Unit, UnitQuaternion, Vector3};
+use ndarray::Array2;
+use std::collections::BTreeMap;
+use std::sync::{Arc, OnceLock};
+
+/// Colour and depth farther apart than this do not show the same moment (the paper's rule).
+pub const DEPTH_APART: i64 = SECOND / 100;
+/// Gaze outside of this range, in units of the picture, is a failure of the tracker (the ancestors' rule).
+const GAZE_RANGE: std::ops::RangeInclusive<f64> = -0.2..=1.2;
+/// Two frames are equally near when their distances differ by less than clocks are rounded, nanoseconds.
+const TIE: i64 = 2000;
+/// Nanoseconds of a clip.
+const CLIP: i64 = CLIP_SECONDS as i64 * SECOND;
+
+/// Colour pictures as stored (not turned), read when they are asked for.
+pub trait ColourFrames: Send + Sync {
+    /// Capture times in nanoseconds, ascending.
+    fn times(&self) -> &[i64];
+    /// Decodes pictures by ascending, distinct indices and hands them to `each` one at a time, with their index.
+    ///
+    /// # Errors
+    /// When one cannot be read.
+    fn read(&self, indices: &[usize], each: &mut dyn FnMut(usize, Image)) -> Result<(), ReadError>;
+}
+
+/// Depth maps on the grid of the colour pictures, not turned.
+pub trait DepthFrames: Send + Sync {
+    /// Capture times in nanoseconds, ascending.
+    fn times(&self) -> &[i64];
+    /// Metres of z-depth, NaN where nothing was measured.
+    ///
+    /// # Errors
+    /// When it cannot be read.
+    fn read(&self, index: usize) -> Result<Array2<f32>, ReadError>;
+}
+
+/// A camera on the device, over time.
+#[derive(Debug, Clone, PartialEq)]
+pub struct MountedCamera {
+    /// For the pictures as stored.
+    pub camera: Camera,
+    pub T_device_camera: Isometry3<f64>,
+}
+
+impl MountedCamera {
+    /// A stand-in where only poses are known: one pixel, and a fisheye, so that no pinhole intrinsics come out of it.
+    #[must_use]
+    pub fn without_lens() -> Self {
+        MountedCamera {
+            camera: Camera {
+                lens: Lens::KannalaBrandt(KannalaBrandt {
+                    fx: 1.0,
+                    fy: 1.0,
+                    cx: 0.0,
+                    cy: 0.0,
+                    radial: [0.0; 4],
+                }),
+                width: 1,
+                height: 1,
+                valid_radius: None,
+            },
+            T_device_camera: Isometry3::identity(),
+        }
+    }
+
+    fn has_lens(&self) -> bool {
+        self.camera != Self::without_lens().camera
+    }
+}
+
+/// One recording. Times are nanoseconds on one clock, whichever the adapter chose.
+pub struct Recording {
+    /// Within the data set; clips are `source/id/000012`.
+    pub id: String,
+    pub source: String,
+    /// From the stored picture to the upright one.
+    pub turn: Turn,
+    pub colour: Option<Box<dyn ColourFrames>>,
+    pub depth: Option<Box<dyn DepthFrames>>,
+    /// When clips begin and end if there are no pictures at hand.
+    pub span: Option<(i64, i64)>,
+    /// Calibrations over time, ascending, at least one; `None` where the camera is not known.
+    pub cameras: Vec<(i64, MountedCamera)>,
+    /// `T_world_device`.
+    pub device: Option<Track<Isometry3<f64>>>,
+    pub up_world: Option<Unit<Vector3<f64>>>,
+    pub gaze: Option<Track<GazeSample>>,
+    /// Left and right, in `hands_frame`.
+    pub hands: [Option<Track<Joints>>; 2],
+    pub hands_frame: JointFrame,
+    /// In the world.
+    pub body: Option<Track<Joints>>,
+    /// The undistortion map, made once.
+    pub remap: OnceLock<Arc<Remap>>,
+}
+
+impl std::fmt::Debug for Recording {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Recording")
+            .field("source", &self.source)
+            .field("id", &self.id)
+            .finish_non_exhaustive()
+    }
+}
+
+/// What the coordinates of hands refer to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum JointFrame {
+    #[default]
+    World,
+    /// The upright camera of the same moment.
+    Camera,
+}
+
+/// Where the wearer looks, as the adapter knows it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum GazeSample {
+    /// A direction from the central pupil frame of Aria glasses.
+    Aria(super::aria::gaze::Gaze, Isometry3<f64>),
+    /// A pixel of the upright picture, and that picture's width and height.
+    Pixel { pixel: [f64; 2], size: [f64; 2] },
+}
+
+impl super::track::Blend for GazeSample {
+    fn blend(&self, other: &Self, weight: f64) -> Option<Self> {
+        match (self, other) {
+            (GazeSample::Aria(a, pose), GazeSample::Aria(b, _)) => {
+                Some(GazeSample::Aria(a.blend(b, weight)?, *pose))
+            }
+            (GazeSample::Pixel { pixel: a, size }, GazeSample::Pixel { pixel: b, .. }) => {
+                Some(GazeSample::Pixel {
+                    pixel: a.blend(b, weight)?,
+                    size: *size,
+                })
+            }
+            _ => None,
+        }
+    }
+}
+
+impl Recording {
+    /// A recording of which nothing is known yet.
+    #[must_use]
+    pub fn new(source: &str, id: &str) -> Self {
+        Recording {
+            id: id.to_owned(),
+            source: source.to_owned(),
+            turn: Turn::None,
+            colour: None,
+            depth: None,
+            span: None,
+            cameras: Vec::new(),
+            device: None,
+            up_world: None,
+            gaze: None,
+            hands: [None, None],
+            hands_frame: JointFrame::World,
+            body: None,
+            remap: OnceLock::new(),
+        }
+    }
+
+    /// Whether clips can be cut as `settings` ask.
+    ///
+    /// # Errors
+    /// When pictures shall be undistorted whose lens is not known.
+    pub fn check(&self, settings: &CutSettings) -> Result<(), ReadError> {
+        let camera = self.cameras.first().map(|(_, mounted)| mounted);
+        let known = camera.is_some_and(MountedCamera::has_lens);
+        if settings.undistort.is_some() && self.colour.is_some() && !known {
+            return Err(ReadError::Settings(format!(
+                "`undistort` needs a lens, and `{}/{}` has none",
+                self.source, self.id
+            )));
+        }
+        Ok(())
+    }
+
+    /// First and last moment.
+    fn extent(&self) -> Option<(i64, i64)> {
+        let times = self.colour.as_ref().map(|colour| colour.times());
+        match times {
+            Some([first, .., last]) => {
+                // The last frame is shown as long as the others.
+                let count = times.map_or(1, <[i64]>::len) as i64;
+                Some((*first, last + (last - first) / (count - 1)))
+            }
+            Some([only]) => Some((*only, *only)),
+            _ => self.span,
+        }
+    }
+
+    /// How many clips there are.
+    #[must_use]
+    pub fn clips(&self, settings: &CutSettings) -> usize {
+        let Some((start, end)) = self.extent() else {
+            return 0;
+        };
+        // A recording that ends within a video frame of the clip's end still has all of it.
+        let slack = (SECOND as f64 / settings.fps / 2.0) as i64;
+        let length = end.saturating_sub(start).saturating_add(slack);
+        if length < CLIP {
+            return usize::from(settings.pad_short);
+        }
+        let stride = (settings.stride * SECOND as f64) as i64;
+        ((length - CLIP) / stride.max(1) + 1) as usize
+    }
+
+    /// The modalities that clips of this recording can have.
+    #[must_use]
+    pub fn modalities(&self) -> Vec<String> {
+        let has_camera = self.device.is_some();
+        let hands = has_camera || self.hands_frame == JointFrame::Camera;
+        [
+            ("rgb", self.colour.is_some()),
+            ("depth", self.depth.is_some()),
+            ("camera", has_camera),
+            ("gaze", self.gaze.is_some()),
+            ("left_hand", hands && self.hands[0].is_some()),
+            ("right_hand", hands && self.hands[1].is_some()),
+            ("body", has_camera && self.body.is_some()),
+        ]
+        .into_iter()
+        .filter(|(_, there)| *there)
+        .map(|(name, _)| name.to_owned())
+        .collect()
+    }
+
+    /// Milliseconds from every colour frame to the depth frame nearest in time.
+    #[must_use]
+    pub fn depth_offsets_ms(&self) -> Vec<Option<f64>> {
+        let (Some(colour), Some(depth)) = (&self.colour, &self.depth) else {
+            return Vec::new();
+        };
+        colour
+            .times()
+            .iter()
+            .map(|time| {
+                let near = nearest(depth.times(), *time)?;
+                Some((depth.times()[near] - time) as f64 / 1e6)
+            })
+            .collect()
+    }
+
+    /// `T_world_camera` of the upright picture.
+    #[must_use]
+    pub fn pose(&self, time: i64) -> Option<Isometry3<f64>> {
+        let mounted = self.mounted(time)?;
+        let T_world_device = self.device.as_ref()?.at(time)?;
+        Some(T_world_device * mounted.T_device_camera * upright(self.turn))
+    }
+
+    fn mounted(&self, time: i64) -> Option<&MountedCamera> {
+        let after = self.cameras.partition_point(|(t, _)| *t <= time);
+        let before = after.checked_sub(1).map(|index| &self.cameras[index]);
+        match (before, self.cameras.get(after)) {
+            (Some(a), Some(b)) => Some(if time - a.0 <= b.0 - time { &a.1 } else { &b.1 }),
+            (a, b) => a.or(b).map(|(_, camera)| camera),
+        }
+    }
+
+    /// Makes clip number `index` (less than [`Recording::clips`]).
+    ///
+    /// # Errors
+    /// When pictures cannot be read.
+    pub fn clip(&self, index: usize, settings: &CutSettings) -> Result<Outcome, ReadError> {
+        let id = format!("{}/{}/{index:06}", self.source, self.id);
+        let Some((first, _)) = self.extent() else {
+            return Ok(Outcome::Dropped {
+                id,
+                reason: DropReason::NothingValid,
+            });
+        };
+        let start = first + (index as f64 * settings.stride * SECOND as f64).round() as i64;
+        let (rgb, depth) = match self.video(start, settings)? {
+            Ok(video) => video,
+            Err(reason) => return Ok(Outcome::Dropped { id, reason }),
+        };
+        let ticks: Vec<i64> = (0..SIGNAL_SAMPLES)
+            .map(|k| start + (k as f64 / SIGNAL_RATE * SECOND as f64).round() as i64)
+            .collect();
+        let camera = self.camera_track(&ticks, settings);
+        let gaze = self
+            .gaze
+            .is_some()
+            .then(|| self.gaze_track(&ticks, settings));
+        let hands = [0, 1].map(|side| {
+            let joints = world_joints(self.hands[side].as_ref()?, &ticks);
+            match self.hands_frame {
+                JointFrame::World => joints_in_camera(&joints, camera.as_ref()?).ok(),
+                JointFrame::Camera => Some(joints_in_frame(
+                    &joints,
+                    SIGNAL_RATE,
+                    &Isometry3::identity(),
+                )),
+            }
+        });
+        let body = camera.as_ref().and_then(|camera| {
+            let joints = self.body.as_ref()?;
+            // A head tilted sideways has no heading: the clip goes without a body.
+            let T_gravity_world = gravity_frame_of(camera).ok()?;
+            Some(joints_in_frame(
+                &world_joints(joints, &ticks),
+                SIGNAL_RATE,
+                &T_gravity_world,
+            ))
+        });
+        let [left_hand, right_hand] = hands;
+        let something = camera
+            .as_ref()
+            .is_some_and(|track| track.valid.contains(&true))
+            || gaze
+                .as_ref()
+                .is_some_and(|track| track.valid.iter().any(|v| *v))
+            || [&left_hand, &right_hand, &body]
+                .into_iter()
+                .flatten()
+                .any(|track: &JointTrack| track.valid.iter().any(|v| *v));
+        if !something && rgb.is_none() {
+            return Ok(Outcome::Dropped {
+                id,
+                reason: DropReason::NothingValid,
+            });
+        }
+        Ok(Outcome::Clip(Box::new(Clip {
+            id,
+            source: self.source.clone(),
+            rgb,
+            depth,
+            camera,
+            gaze,
+            left_hand,
+            right_hand,
+            body,
+            declared: BTreeMap::new(),
+        })))
+    }
+}
+
+/// `R_stored_upright`: a picture turned clockwise has its new x along the old -y and its new y along the old x.
+#[must_use]
+pub fn upright(turn: Turn) -> Isometry3<f64> {
+    let quarter = match turn {
+        Turn::None => 0.0,
+        Turn::Clockwise => -1.0,
+        Turn::Half => 2.0,
+        Turn::CounterClockwise => 1.0,
+    };
+    let rotation =
+        Rotation3::from_axis_angle(&Vector3::z_axis(), quarter * std::f64::consts::FRAC_PI_2);
+    Isometry3::from_parts(
+        nalgebra::Translation3::identity(),
+        UnitQuaternion::from_rotation_matrix(&rotation),
+    )
+}

@@ -1,0 +1,311 @@
+//! Clips in shards: where [`super::convert`] puts them, and a [`Source`] that gives them back.
+//!
+//! A folder of converted clips is `<modality>/<data set>/shard-000000.tar` with [`FILE`] beside it, which says what was asked and
+//! what became of it. An artifact of the op `clips` holds such folders by split, and is read as one.
+
+use super::convert::{ShardSink, Tally};
+use super::{ClipSource, Outcome, ReadError};
+use crate::clip::Clip;
+use crate::clip::shard::ShardError;
+use crate::clip::store::{self, ClipSet};
+use crate::formats::read_error::Position;
+use crate::formats::write_atomically;
+use crate::modality::ClipFormat;
+use serde::{Deserialize, Serialize};
+use std::ops::Range;
+use std::path::{Path, PathBuf};
+
+/// The name of the file that describes a folder of converted clips.
+pub const FILE: &str = "clips.json";
+/// The splits of an artifact.
+const SPLITS: [&str; 3] = ["train", "validation", "test"];
+
+/// What [`FILE`] says.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Header {
+    /// The data set.
+    pub source: String,
+    /// Sizes of the clips.
+    pub format: ClipFormat,
+    /// What was asked, as the command sees it; a conversion goes on only where the same is asked again.
+    pub request: serde_json::Value,
+    /// What became of it; none while it is not finished.
+    pub tally: Option<Tally>,
+}
+
+impl From<ShardError> for ReadError {
+    fn from(error: ShardError) -> Self {
+        match error {
+            ShardError::Io { path, error } => ReadError::io(&path, error),
+            ShardError::Member {
+                path,
+                member,
+                reason,
+            } => ReadError::malformed(
+                &path,
+                Position::File,
+                format!("member `{member}`: {reason}"),
+            ),
+            ShardError::Tar {
+                path,
+                offset,
+                reason,
+            } => ReadError::malformed(&path, Position::Offset(offset), reason),
+            ShardError::Empty(path) => ReadError::missing(&path, "there are no shards here"),
+            ShardError::NoSample { index, count } => ReadError::OutOfRange {
+                source_name: "shards".to_owned(),
+                index,
+                len: count,
+            },
+        }
+    }
+}
+
+/// Writes shards below a folder; a marker beside them says that one is finished.
+#[derive(Debug, Clone)]
+pub struct TarSink {
+    root: PathBuf,
+    markers: PathBuf,
+}
+
+impl TarSink {
+    /// Shards below `root`, markers in `markers`; both are made.
+    ///
+    /// # Errors
+    /// When the disk refuses.
+    pub fn new(root: &Path, markers: &Path) -> Result<Self, ReadError> {
+        for folder in [root, markers] {
+            std::fs::create_dir_all(folder).map_err(|cause| ReadError::io(folder, cause))?;
+        }
+        Ok(TarSink {
+            root: root.to_owned(),
+            markers: markers.to_owned(),
+        })
+    }
+
+    fn marker(&self, shard: usize) -> PathBuf {
+        self.markers.join(format!("shard-{shard:06}.json"))
+    }
+}
+
+impl ShardSink for TarSink {
+    fn finished(&self, shard: usize) -> Option<Tally> {
+        serde_json::from_slice(&std::fs::read(self.marker(shard)).ok()?).ok()
+    }
+
+    fn write(
+        &self,
+        shard: usize,
+        clips: &mut dyn Iterator<Item = Result<Clip, ReadError>>,
+        tally: &dyn Fn() -> Tally,
+    ) -> Result<(), ReadError> {
+        store::write_clips(&self.root, shard as u32, clips)?;
+        write_json(&self.marker(shard), &tally())
+    }
+}
+
+fn write_json(path: &Path, value: &impl Serialize) -> Result<(), ReadError> {
+    let text =
+        serde_json::to_vec_pretty(value).map_err(|error| ReadError::Settings(error.to_string()))?;
+    Ok(write_atomically(path, &text)?)
+}
+
+/// A folder that a conversion fills.
+#[derive(Debug)]
+pub struct Folder {
+    root: PathBuf,
+    header: Header,
+}
+
+impl Folder {
+    /// Begins a conversion, or goes on with it.
+    ///
+    /// # Errors
+    /// When the folder holds something else, or the disk refuses.
+    pub fn begin(root: &Path, header: Header) -> Result<Self, ReadError> {
+        let file = root.join(FILE);
+        match std::fs::read(&file) {
+            Ok(bytes) => {
+                let there: Header = serde_json::from_slice(&bytes).map_err(|error| {
+                    ReadError::malformed(
+                        &file,
+                        Position::Line(error.line() as u64),
+                        error.to_string(),
+                    )
+                })?;
+                let same = |a: &Header, b: &Header| {
+                    (&a.source, &a.format, &a.request) == (&b.source, &b.format, &b.request)
+                };
+                if !same(&there, &header) {
+                    let reason = "holds clips of another conversion; name another folder";
+                    return Err(ReadError::unsupported(root, reason));
+                }
+            }
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => {
+                let empty =
+                    std::fs::read_dir(root).map_or(true, |mut inside| inside.next().is_none());
+                if !empty {
+                    let reason = "is not empty and holds no converted clips; name another folder";
+                    return Err(ReadError::unsupported(root, reason));
+                }
+                std::fs::create_dir_all(root).map_err(|cause| ReadError::io(root, cause))?;
+                write_json(&file, &header)?;
+            }
+            Err(error) => return Err(ReadError::io(&file, error)),
+        }
+        Ok(Folder {
+            root: root.to_owned(),
+            header,
+        })
+    }
+
+    /// Where the shards go.
+    ///
+    /// # Errors
+    /// When the disk refuses.
+    pub fn sink(&self) -> Result<TarSink, ReadError> {
+        TarSink::new(&self.root, &self.root.join(".finished"))
+    }
+
+    /// Writes what became of it.
+    ///
+    /// # Errors
+    /// When the disk refuses.
+    pub fn finish(mut self, tally: Tally) -> Result<(), ReadError> {
+        self.header.tally = Some(tally);
+        write_json(&self.root.join(FILE), &self.header)
+    }
+}
+
+/// Clips read from shards.
+#[derive(Debug)]
+pub struct ShardClips {
+    name: String,
+    sets: Vec<(String, ClipSet)>,
+    format: Option<ClipFormat>,
+}
+
+impl ShardClips {
+    /// A folder of shards, or of splits of shards.
+    ///
+    /// # Errors
+    /// When there are none, or a tar is damaged.
+    pub fn open(root: &Path) -> Result<Self, ReadError> {
+        let absent = || ReadError::absent(root, "there are no shards of clips here");
+        let mut sets = Vec::new();
+        for split in SPLITS {
+            let folder = root.join(split);
+            if holds_shards(&folder) {
+                sets.push((split.to_owned(), ClipSet::open(&folder)?));
+            }
+        }
+        if sets.is_empty() && holds_shards(root) {
+            sets.push((String::new(), ClipSet::open(root)?));
+        }
+        let first = sets.first().ok_or_else(absent)?;
+        let id = first.1.ids().first().ok_or_else(absent)?;
+        Ok(ShardClips {
+            name: id.split('/').next().unwrap_or("clips").to_owned(),
+            format: described_format(root),
+            sets,
+        })
+    }
+
+    fn place(&self, mut index: usize) -> Option<(&ClipSet, usize)> {
+        for (_, set) in &self.sets {
+            if index < set.len() {
+                return Some((set, index));
+            }
+            index -= set.len();
+        }
+        None
+    }
+}
+
+/// Whether `<modality>/<data set>/shard-*.tar` is below a folder.
+fn holds_shards(root: &Path) -> bool {
+    fn below(folder: &Path, depth: usize) -> bool {
+        let Ok(entries) = std::fs::read_dir(folder) else {
+            return false;
+        };
+        entries.flatten().any(|entry| {
+            let name = entry.file_name();
+            let shard = name.to_str().is_some_and(|name| {
+                name.starts_with("shard-")
+                    && Path::new(name).extension().is_some_and(|e| e == "tar")
+            });
+            (depth < 2 && shard)
+                || (depth > 0 && entry.path().is_dir() && below(&entry.path(), depth - 1))
+        })
+    }
+    below(root, 2)
+}
+
+/// The sizes that the folder's own description, or that of the artifact it belongs to, speaks of.
+fn described_format(root: &Path) -> Option<ClipFormat> {
+    let read = |path: PathBuf| -> Option<serde_json::Value> {
+        serde_json::from_slice(&std::fs::read(path).ok()?).ok()
+    };
+    let header = read(root.join(FILE)).map(|value| value["format"].clone());
+    let manifest = || {
+        let mut folders = [Some(root), root.parent()].into_iter().flatten();
+        let value = folders.find_map(|folder| read(folder.join("manifest.json")))?;
+        Some(value["contents"]["format"].clone())
+    };
+    serde_json::from_value(header.or_else(manifest)?).ok()
+}
+
+impl ClipSource for ShardClips {
+    fn name(&self) -> &str {
+        &self.name
+    }
+
+    fn len(&self) -> usize {
+        self.sets.iter().map(|(_, set)| set.len()).sum()
+    }
+
+    fn modalities(&self) -> Vec<String> {
+        let there = |name: &&str| {
+            let mut sets = self.sets.iter();
+            sets.any(|(_, set)| set.shards().modalities().any(|known| known == *name))
+        };
+        let names = crate::modality::BUILT_IN.iter().copied();
+        names.filter(there).map(str::to_owned).collect()
+    }
+
+    fn format(&self) -> Option<ClipFormat> {
+        self.format.clone()
+    }
+
+    fn recordings(&self) -> Vec<(String, Range<usize>)> {
+        let ids = self.sets.iter().flat_map(|(_, set)| set.ids());
+        let mut found: Vec<(String, Range<usize>)> = Vec::new();
+        for (index, id) in ids.enumerate() {
+            // `data set/recording/number`; without a recording, every clip stands for itself.
+            let recording = match id.rsplit_once('/') {
+                Some((front, _)) if front.contains('/') => front,
+                _ => id,
+            };
+            match found.last_mut() {
+                Some((name, range)) if name == recording => range.end = index + 1,
+                _ => found.push((recording.to_owned(), index..index + 1)),
+            }
+        }
+        for (name, _) in &mut found {
+            if let Some((_, recording)) = name.split_once('/') {
+                *name = recording.to_owned();
+            }
+        }
+        found
+    }
+
+    fn clip(&self, index: usize) -> Result<Outcome, ReadError> {
+        let (set, inside) = self.place(index).ok_or_else(|| ReadError::OutOfRange {
+            source_name: self.name.clone(),
+            index,
+            len: self.len(),
+        })?;
+        Ok(Outcome::Clip(Box::new(set.clip(inside)?)))
+    }
+}

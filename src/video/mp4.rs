@@ -1,0 +1,192 @@
+//! The part of ISO base media files (mp4, mov) that a video reader needs: the first video track's codec configuration and, for
+//! every sample, where its bytes are and when it is shown. Fragmented files and edit lists included.
+//!
+//! The reader is our own because files come from anywhere: every count is checked against the file before anything is
+//! allocated for it, nothing here can panic, and only the index is held in memory, never the media.
+
+mod boxes;
+mod fragment;
+mod samples;
+
+use boxes::{Boxes, be32, be64};
+use fragment::Defaults;
+
+use crate::formats::ReadError;
+use crate::formats::read_error::Position;
+use std::fs::File;
+use std::io::{BufReader, Read, Seek, SeekFrom};
+use std::path::Path;
+
+/// A sample table entry is 24 bytes in memory; a file whose samples are smaller than this on average is not a video, and
+/// refusing it keeps the index below the size of the file.
+const SMALLEST_MEAN_SAMPLE: u64 = 24;
+/// Boxes inside boxes.
+const DEEPEST: usize = 12;
+
+/// The first video track of a file.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Track {
+    /// Four characters of the sample description: `avc1`, `hvc1`, `av01`, ...
+    pub codec: [u8; 4],
+    /// The payload of `avcC`, when there is one.
+    pub avc_configuration: Option<Vec<u8>>,
+    /// Degrees clockwise by which the decoded picture has to be turned for display: 0, 90, 180 or 270.
+    pub rotation: u32,
+    /// Ticks per second of [`Sample::time`].
+    pub timescale: u32,
+    /// In decoding order.
+    pub samples: Vec<Sample>,
+    /// First tick that is shown (edit list); earlier samples are decoded but not part of the video.
+    pub first_shown: i64,
+}
+
+/// One coded picture.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Sample {
+    /// Bytes from the start of the file.
+    pub offset: u64,
+    /// Presentation time in ticks.
+    pub time: i64,
+    /// Bytes.
+    pub size: u32,
+    /// Decoding can start here.
+    pub sync: bool,
+}
+
+/// Whether the file starts like an ISO base media file.
+pub fn sniff(head: &[u8]) -> bool {
+    head.len() >= 8
+        && matches!(
+            &head[4..8],
+            b"ftyp" | b"moov" | b"mdat" | b"wide" | b"free" | b"skip"
+        )
+}
+
+/// Reads the index of the first video track.
+pub fn read(path: &Path) -> Result<Track, ReadError> {
+    let file = File::open(path).map_err(|cause| ReadError::io(path, cause))?;
+    let len = file
+        .metadata()
+        .map_err(|cause| ReadError::io(path, cause))?
+        .len();
+    let mut top = TopLevel {
+        path,
+        file: BufReader::new(file),
+        len,
+    };
+    let mut track: Option<Track> = None;
+    let mut fragments = Defaults::default();
+    let mut at = 0;
+    while at + 8 <= len {
+        let (kind, header, size) = top.box_header(at)?;
+        match &kind {
+            b"moov" if track.is_none() => {
+                let bytes = top.payload(at + header, size - header)?;
+                let reader = Boxes {
+                    path,
+                    base: at + header,
+                    file_len: len,
+                };
+                let (found, defaults) = reader.movie(&bytes)?;
+                track = Some(found);
+                fragments = defaults;
+            }
+            b"moof" => {
+                let bytes = top.payload(at + header, size - header)?;
+                let reader = Boxes {
+                    path,
+                    base: at + header,
+                    file_len: len,
+                };
+                let track = track.as_mut().ok_or_else(|| {
+                    ReadError::malformed(
+                        path,
+                        Position::Offset(at),
+                        "a movie fragment before the movie header",
+                    )
+                })?;
+                reader.fragment(&bytes, at, track, &mut fragments)?;
+            }
+            _ => {}
+        }
+        at += size;
+    }
+    let track = track.ok_or_else(|| {
+        ReadError::malformed(
+            path,
+            Position::File,
+            "no movie header (`moov`): not an mp4, or cut off while it was recorded",
+        )
+    })?;
+    check(path, len, &track)?;
+    Ok(track)
+}
+
+/// Samples must lie inside the file.
+fn check(path: &Path, len: u64, track: &Track) -> Result<(), ReadError> {
+    if track.samples.is_empty() {
+        return Err(ReadError::malformed(
+            path,
+            Position::File,
+            "the video track has no samples",
+        ));
+    }
+    for (index, sample) in track.samples.iter().enumerate() {
+        if sample
+            .offset
+            .checked_add(u64::from(sample.size))
+            .is_none_or(|end| end > len)
+        {
+            return Err(ReadError::malformed(
+                path,
+                Position::Offset(sample.offset),
+                format!(
+                    "sample {index} of {} bytes lies beyond the end of the file ({len} bytes): truncated?",
+                    sample.size
+                ),
+            ));
+        }
+    }
+    Ok(())
+}
+
+struct TopLevel<'a> {
+    path: &'a Path,
+    file: BufReader<File>,
+    len: u64,
+}
+
+impl TopLevel<'_> {
+    /// Kind, size of the header, size of the box.
+    fn box_header(&mut self, at: u64) -> Result<([u8; 4], u64, u64), ReadError> {
+        let bytes = self.payload(at, 16.min(self.len - at))?;
+        let short = u64::from(be32(&bytes, 0).unwrap_or(0));
+        let kind = [bytes[4], bytes[5], bytes[6], bytes[7]];
+        let (header, size) = match short {
+            0 => (8, self.len - at),
+            1 => (16, be64(&bytes, 8).unwrap_or(0)),
+            size => (8, size),
+        };
+        if size < header || size > self.len - at {
+            return Err(ReadError::malformed(
+                self.path,
+                Position::Offset(at),
+                format!(
+                    "box `{}` claims {size} bytes, {} are left: truncated?",
+                    kind.escape_ascii(),
+                    self.len - at
+                ),
+            ));
+        }
+        Ok((kind, header, size))
+    }
+
+    fn payload(&mut self, at: u64, size: u64) -> Result<Vec<u8>, ReadError> {
+        debug_assert!(at + size <= self.len, "checked by box_header");
+        let fail = |cause| ReadError::io(self.path, cause);
+        self.file.seek(SeekFrom::Start(at)).map_err(fail)?;
+        let mut bytes = vec![0; size as usize];
+        self.file.read_exact(&mut bytes).map_err(fail)?;
+        Ok(bytes)
+    }
+}
