@@ -12,7 +12,7 @@ mod released;
 mod torch;
 
 use reviv::decoding::DecodingSettings;
-use reviv::decoding::reconstructor::{Reconstructor, Wish};
+use reviv::decoding::reconstructor::{GenerationRequest, Reconstructor};
 use reviv::engine::Compute;
 use reviv::import::{Checkpoint, ImportOptions, import};
 use reviv::mget::Size;
@@ -157,7 +157,7 @@ fn decode(folder: &Path) {
     println!("opened in {:.1} s", start.elapsed().as_secs_f64());
     let given = ["rgb".to_owned()];
     let wanted = ["body", "camera", "gaze", "left_hand", "right_hand"].map(str::to_owned);
-    let wish = Wish {
+    let wish = GenerationRequest {
         given: &given,
         wanted: &wanted,
         decoding: &fast(),

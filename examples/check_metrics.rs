@@ -67,7 +67,7 @@ fn check(directory: &Path, case: &Value) -> Result<(), String> {
     if let Some(error) = case.get("error") {
         return match computed {
             Ok(values) => Err(format!("must be refused ({error}), got {values:?}")),
-            Err(failure) if failure.is::<reviv::evaluation::Refusal>() => Ok(()),
+            Err(failure) if failure.is::<reviv::evaluation::MetricError>() => Ok(()),
             Err(failure) => Err(format!("failed instead of refusing: {failure}")),
         };
     }

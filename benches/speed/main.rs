@@ -65,7 +65,7 @@ enum Case {
     /// What packed samples save; our side alone.
     Packing,
     /// What keeping less for backward saves; our side alone.
-    Recompute,
+    ActivationCheckpointing,
     /// Generation with the preset `fast`.
     DecodingFast,
     /// Generation with the preset `paper`.
@@ -87,7 +87,7 @@ impl Case {
             Self::MgetTiny => "MGET `tiny` (8 samples, 256 + 256 tokens)",
             Self::MgetBase => "MGET `base` (1 sample, 1024 + 1024 tokens)",
             Self::Packing => "MGET `tiny` (8 samples, at most 512 + 512 tokens)",
-            Self::Recompute => "MGET `tiny` (8 samples, 1024 + 1024 tokens)",
+            Self::ActivationCheckpointing => "MGET `tiny` (8 samples, 1024 + 1024 tokens)",
             Self::DecodingFast => "decoding `fast` (1 clip: camera, gaze, body from video tokens)",
             Self::DecodingPaper => {
                 "decoding `paper` (1 clip: camera, gaze, body from video tokens)"
@@ -100,14 +100,14 @@ impl Case {
         match self {
             Self::MgetTiny => 5,
             Self::Tokenizer | Self::Packing | Self::DecodingFast => 3,
-            Self::Video | Self::MgetBase | Self::Recompute => 2,
+            Self::Video | Self::MgetBase | Self::ActivationCheckpointing => 2,
             Self::DecodingPaper => 1,
         }
     }
 
     /// Whether PyTorch's side has it.
     fn has_peer(self) -> bool {
-        !matches!(self, Self::Packing | Self::Recompute)
+        !matches!(self, Self::Packing | Self::ActivationCheckpointing)
     }
 
     /// Our side.
@@ -118,7 +118,7 @@ impl Case {
             Self::MgetTiny => mget::run(meter, mget::TINY, 8, 256),
             Self::MgetBase => mget::run(meter, mget::BASE, 1, 1024),
             Self::Packing => mget::packing(meter),
-            Self::Recompute => mget::recompute(meter),
+            Self::ActivationCheckpointing => mget::activation_checkpointing(meter),
             Self::DecodingFast => decoding::run(meter, decoding::FAST),
             Self::DecodingPaper => decoding::run(meter, decoding::PAPER),
         }

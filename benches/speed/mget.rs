@@ -119,7 +119,7 @@ pub fn run(meter: &Meter, size: Size, samples: usize, tokens: usize) {
 }
 
 /// A step with all activations kept, and one that computes them again in backward.
-pub fn recompute(meter: &Meter) {
+pub fn activation_checkpointing(meter: &Meter) {
     let spec = spec(TINY);
     let batch = batch(&spec, &vec![mask(1024); 8]);
     measure_step(meter, "train step, all kept", model(&spec), &batch);
@@ -138,7 +138,10 @@ pub fn recompute(meter: &Meter) {
 /// padding would.
 pub fn packing(meter: &Meter) {
     let spec = spec(TINY);
-    for (name, overflow) in [("packed", Overflow::Drop), ("padded", Overflow::Respill)] {
+    for (name, overflow) in [
+        ("packed", Overflow::Drop),
+        ("padded", Overflow::Redistribute),
+    ] {
         let settings = MaskingSettings {
             input_tokens: TokenBudget::Fixed(512),
             target_tokens: TokenBudget::Fixed(512),

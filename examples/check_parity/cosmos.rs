@@ -172,7 +172,7 @@ fn settings(file: &Value) -> Outcome<VideoSettings> {
 fn network(mut file: Vectors, report: &mut Report) -> Outcome {
     let settings = settings(&file.settings)?;
     let compute = Compute::cpu();
-    let mut network = Network::new(&Initialise::to_load(&compute), &settings)?;
+    let mut network = Network::new(&Initialise::empty(&compute), &settings)?;
     let unused = settings.never_run();
     let mut weights: Weights = file.checkpoint()?;
     weights

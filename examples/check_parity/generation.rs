@@ -3,11 +3,11 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use reviv::decoding::filter::{Draw, Filter, TopK, kept_tokens};
+use reviv::decoding::filter::{Filter, Sampling, TopK, kept_tokens};
 use reviv::decoding::generate::{Checks, StepTrace, generate_checked};
 use reviv::decoding::plan::plan;
 use reviv::decoding::schedule::{TemperatureSchedule, TokenSchedule, cosine, linear};
-use reviv::decoding::settings::{Order, Scheme, TargetChanges};
+use reviv::decoding::settings::{Sampler, Scheme, TargetChanges};
 use reviv::decoding::{DecodingSettings, MgetTokens, Sample, Slot, TokenModality};
 use reviv::engine::{Compute, Parameters, Weights};
 use reviv::mget::names::modality_from_release;
@@ -94,12 +94,12 @@ fn schedules(all: &Value, report: &mut Report) {
     }
 }
 
-/// Order, counts, temperatures, guidance and hidden modalities of several targets.
+/// Sampler, counts, temperatures, guidance and hidden modalities of several targets.
 fn chained(index: usize, case: &Value, report: &mut Report) {
     let args = &case["args"];
     let (conditions, targets) = (names(&args["cond_domains"]), names(&args["target_domains"]));
     let mut settings = DecodingSettings {
-        order: Order::Chained,
+        order: Sampler::Chained,
         hide: Some(conditions.clone()),
         grow: args["cfg_grow_conditioning"].as_bool().unwrap_or(false),
         ..DecodingSettings::default()
@@ -228,7 +228,7 @@ fn filters(mut file: Vectors, report: &mut Report) -> Outcome {
             top_k: top_k(&case["top_k"], case["top_k_is_int"] == Value::Bool(true)),
             top_p: case["top_p"].as_f64().unwrap_or(0.0),
             temperature: 1.0,
-            draw: Draw::Random,
+            draw: Sampling::Random,
         };
         let mut kept = vec![false; values.len()];
         for (row, logits) in values.chunks(shape[1]).enumerate() {
@@ -277,7 +277,7 @@ fn generation(folder: &Path, stem: &str, report: &mut Report) -> Outcome {
     let set = folder.parent().ok_or("a folder of vectors lies in a set")?;
     let model_settings = json(&set.join("mget/reviv256_a.json"))?["settings"].clone();
     let (spec, theirs) = spec_of(&model_settings)?;
-    let mut model = Mget::to_load(&spec, &Compute::cpu())?;
+    let mut model = Mget::empty(&spec, &Compute::cpu())?;
     model.load(&parameters_of(&file.checkpoint()?, &model))?;
     let tokens = MgetTokens::new(&model);
 
@@ -299,9 +299,9 @@ fn generation(folder: &Path, stem: &str, report: &mut Report) -> Outcome {
     let mut slots = Vec::new();
     for modality in &spec.modalities {
         slots.push(match modality.name.as_str() {
-            "rgb" => Slot::given(rgb.clone()),
+            "rgb" => Slot::input(rgb.clone()),
             "pixels" => Slot::Pixels(Content::Floats(pixels)),
-            _ => Slot::unknown(modality.count()),
+            _ => Slot::masked(modality.count()),
         });
     }
     if let (Ok(places), Ok(partial)) = (
@@ -318,7 +318,7 @@ fn generation(folder: &Path, stem: &str, report: &mut Report) -> Outcome {
 
     let number = |key: &str| settings[key].as_f64().unwrap_or(0.0);
     let mut decoding = DecodingSettings {
-        order: Order::Chained,
+        order: Sampler::Chained,
         hide: Some(names(&settings["cfg_hidden_at_start"])),
         grow: settings["cfg_grow_conditioning"].as_bool().unwrap_or(false),
         ..DecodingSettings::default()
@@ -330,7 +330,7 @@ fn generation(folder: &Path, stem: &str, report: &mut Report) -> Outcome {
     decoding.all.guidance = number("cfg_scale");
     decoding.all.top_p = number("top_p");
     decoding.all.top_k = top_k(&settings["top_k"], settings["top_k"].is_u64());
-    decoding.all.draw = Draw::MostLikely;
+    decoding.all.draw = Sampling::MostLikely;
 
     // Random positions are inputs: (modality, step within its target) -> what the reference drew.
     let mut positions = BTreeMap::new();

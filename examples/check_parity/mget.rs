@@ -137,7 +137,7 @@ pub(super) fn spec_of(settings: &Value) -> Outcome<(MgetSpec, Vec<String>)> {
 
 fn fixture(file: &Vectors) -> Outcome<Fixture> {
     let (spec, theirs) = spec_of(&file.settings)?;
-    let mut model = Mget::to_load(&spec, &Compute::cpu())?;
+    let mut model = Mget::empty(&spec, &Compute::cpu())?;
     model.load(&parameters_of(&file.checkpoint()?, &model))?;
 
     let samples = file.tensor(&format!("in.{}.tensor", theirs[0]))?.shape[0];

@@ -78,7 +78,7 @@ fn build(file: &Vectors, compute: &Compute) -> Outcome<VqVae> {
         commitment: number("commitment")?,
         ..VqSettings::default()
     };
-    let mut model = VqVae::new(&Initialise::to_load(compute), &settings, &shape)?;
+    let mut model = VqVae::new(&Initialise::empty(compute), &settings, &shape)?;
     model.load(&file.checkpoint()?)?;
     Ok(model)
 }

@@ -1,7 +1,7 @@
 //! `reviv compare`: runs, arms and seeds in one table, paired on common clips; or two trajectory files, as `evo` does it.
 
 use super::terminal::{Failure, Terminal};
-use crate::evaluation::compare::{CompareSettings, Entrant, compare};
+use crate::evaluation::compare::{CompareSettings, Method, compare};
 use crate::evaluation::intervals;
 use crate::evaluation::published::Published;
 use crate::evaluation::render::{Format, render};
@@ -72,7 +72,7 @@ impl super::Run for Compare {
             ..CompareSettings::default()
         };
         settings.interval.level = self.level;
-        let mut entrants: Vec<Entrant> = Vec::new();
+        let mut entrants: Vec<Method> = Vec::new();
         for name in &self.runs {
             let mut found = entrants_of(name, &self.place, &settings.columns)?;
             for entrant in &mut found {
@@ -209,7 +209,7 @@ fn numbers(errors: &TrajectoryErrors) -> serde_json::Value {
 ///
 /// Stages of a run that score nothing of `columns` are left out, if another of its stages does: a table of depth has no row
 /// for scores of hands, which may be of other clips.
-pub fn entrants_of(name: &str, runs: &Path, columns: &[String]) -> Result<Vec<Entrant>, Failure> {
+pub fn entrants_of(name: &str, runs: &Path, columns: &[String]) -> Result<Vec<Method>, Failure> {
     let path = Path::new(name);
     let read = |path: &Path| {
         Scores::read(path)
@@ -217,7 +217,7 @@ pub fn entrants_of(name: &str, runs: &Path, columns: &[String]) -> Result<Vec<En
     };
     if path.is_file() || path.join(FILE).is_file() {
         let scores = read(path)?;
-        return Ok(vec![Entrant {
+        return Ok(vec![Method {
             label: scores.system.clone(),
             seeds: vec![scores],
         }]);
@@ -252,7 +252,7 @@ pub fn entrants_of(name: &str, runs: &Path, columns: &[String]) -> Result<Vec<En
         let asked = |scores: &Scores| !any || scores.has(columns);
         is_scores(*key) && found.get(key).is_none_or(asked)
     };
-    let mut entrants: Vec<Entrant> = Vec::new();
+    let mut entrants: Vec<Method> = Vec::new();
     for cell in &schedule.cells {
         let scored: Vec<_> = cell.stages.iter().filter(|(_, key)| is_row(key)).collect();
         for (stage, key) in &scored {
@@ -271,7 +271,7 @@ pub fn entrants_of(name: &str, runs: &Path, columns: &[String]) -> Result<Vec<En
             };
             match entrants.iter_mut().find(|e| e.label == label) {
                 Some(entrant) => entrant.seeds.push(scores),
-                None => entrants.push(Entrant {
+                None => entrants.push(Method {
                     label,
                     seeds: vec![scores],
                 }),

@@ -1,6 +1,6 @@
 //! `reviv gc`: prunes the cache.
 
-use super::run::{Place, tell};
+use super::run::{RunsDir, tell};
 use super::terminal::{Failure, Terminal};
 use crate::run::gc::{Options, prune};
 
@@ -17,7 +17,7 @@ pub struct Gc {
     #[arg(long)]
     json: bool,
     #[command(flatten)]
-    place: Place,
+    place: RunsDir,
 }
 
 impl super::Run for Gc {

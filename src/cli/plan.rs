@@ -65,7 +65,7 @@ struct Outside<'a> {
 impl Outside<'_> {
     /// Of what is too large to read now, a stand-in that no artifact was ever made from.
     fn hash(&mut self, path: &Path) -> std::io::Result<blake3::Hash> {
-        let print = self.prints.quickly(path, QUICK_BYTES);
+        let print = self.prints.within_limit(path, QUICK_BYTES);
         match print.map_err(std::io::Error::other)? {
             Ok(print) => Ok(print.hash),
             Err(unread) => {

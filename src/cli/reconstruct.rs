@@ -1,7 +1,7 @@
 //! `reviv reconstruct`: `experiments/reconstruct.yaml` with a video and a model.
 
 use super::request::open;
-use super::run::{Place, interruptible, progress, tell};
+use super::run::{RunsDir, interruptible, progress, tell};
 use super::terminal::{Failure, Terminal};
 use crate::experiment::catalog::Catalog;
 use crate::experiment::load::Request;
@@ -9,7 +9,7 @@ use crate::reconstruction::folder::{FOLDER, Manifest, PAGE};
 use crate::reconstruction::predictions::ScaleStatus;
 use crate::run::execute::{Job, Outcome, cache_of, execute};
 use crate::run::schedule::Schedule;
-use crate::run::{Crew, Interrupt, RunDirectory, RunError, Shard, State, files, metrics};
+use crate::run::{Interrupt, RunDirectory, RunError, Shard, State, WorkerPool, files, metrics};
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
@@ -54,7 +54,7 @@ pub struct Reconstruct {
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
     #[command(flatten)]
-    place: Place,
+    place: RunsDir,
 }
 
 impl super::Run for Reconstruct {
@@ -82,7 +82,7 @@ impl super::Run for Reconstruct {
             runs: &self.place.runs,
             only: None,
             shard: Shard::WHOLE,
-            crew: Crew::alone(),
+            crew: WorkerPool::alone(),
             progress: &progress,
             interrupt: &interrupt,
         })

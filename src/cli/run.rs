@@ -5,7 +5,7 @@ use super::sweep_table;
 use super::terminal::{Failure, Terminal};
 use crate::experiment::catalog::Catalog;
 use crate::run::execute::{Job, Outcome, execute};
-use crate::run::{Crew, Interrupt, Progress, RunError, Shard, State};
+use crate::run::{Interrupt, Progress, RunError, Shard, State, WorkerPool};
 use std::path::{Path, PathBuf};
 
 /// Run an experiment or a sweep; continue it where it was interrupted
@@ -27,12 +27,12 @@ pub struct Run {
     #[arg(long, short, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
     jobs: Option<u16>,
     #[command(flatten)]
-    place: Place,
+    place: RunsDir,
 }
 
 /// Where runs are kept.
 #[derive(Debug, Clone, clap::Args)]
-pub struct Place {
+pub struct RunsDir {
     /// The directory of runs and of the cache
     #[arg(long, value_name = "DIR", default_value = "runs")]
     pub runs: PathBuf,
@@ -49,7 +49,7 @@ impl super::Run for Run {
             runs: &self.place.runs,
             only: self.only.as_deref(),
             shard: self.shard,
-            crew: Crew::of_this_machine(self.jobs.map(usize::from)),
+            crew: WorkerPool::of_this_machine(self.jobs.map(usize::from)),
             progress: &progress,
             interrupt: &interrupt,
         };

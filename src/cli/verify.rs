@@ -1,6 +1,6 @@
 //! `reviv verify`: does a run still hold?
 
-use super::run::{Place, find, interruptible, progress, tell};
+use super::run::{RunsDir, find, interruptible, progress, tell};
 use super::terminal::{Failure, Terminal};
 use crate::run::verify::{Redo, Verdict, verify};
 
@@ -20,7 +20,7 @@ pub struct Verify {
     #[arg(long)]
     json: bool,
     #[command(flatten)]
-    place: Place,
+    place: RunsDir,
 }
 
 impl super::Run for Verify {

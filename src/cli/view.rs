@@ -1,6 +1,6 @@
 //! `reviv view`: the page of a reconstruction.
 
-use super::run::{Place, find, tell};
+use super::run::{RunsDir, find, tell};
 use super::terminal::{Failure, Terminal};
 use crate::reconstruction::folder::{FOLDER, PAGE};
 use crate::run::execute::cache_of;
@@ -18,7 +18,7 @@ pub struct View {
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
     #[command(flatten)]
-    place: Place,
+    place: RunsDir,
 }
 
 impl super::Run for View {

@@ -12,7 +12,7 @@ pub struct Filter {
     /// Tokens after the one that crosses this mass are dropped; 0 (or 1) is off.
     pub top_p: f64,
     pub temperature: f64,
-    pub draw: Draw,
+    pub draw: Sampling,
 }
 
 /// How many of the largest logits stay.
@@ -45,7 +45,7 @@ impl TopK {
 /// How one of the remaining tokens is taken.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
-pub enum Draw {
+pub enum Sampling {
     /// By its probability.
     #[default]
     Random,
@@ -94,8 +94,8 @@ pub fn pick(logits: &[f32], filter: &Filter, uniform: f64) -> Pick {
                 .filter(|w| w.is_finite())
                 .sum();
             let token = match filter.draw {
-                Draw::MostLikely => best,
-                Draw::Random => {
+                Sampling::MostLikely => best,
+                Sampling::Random => {
                     drawn(logits.iter().map(|&l| weight(l)), uniform * total).unwrap_or(best)
                 }
             };
@@ -104,8 +104,8 @@ pub fn pick(logits: &[f32], filter: &Filter, uniform: f64) -> Pick {
         Some(kept) => {
             let total: f64 = kept.iter().map(|&i| weight(logits[i as usize])).sum();
             let token = match filter.draw {
-                Draw::MostLikely => best,
-                Draw::Random => drawn(
+                Sampling::MostLikely => best,
+                Sampling::Random => drawn(
                     kept.iter().map(|&i| weight(logits[i as usize])),
                     uniform * total,
                 )
@@ -242,7 +242,7 @@ mod tests {
         top_k: TopK::Off,
         top_p: 0.0,
         temperature: 1.0,
-        draw: Draw::Random,
+        draw: Sampling::Random,
     };
 
     #[test]

@@ -3,7 +3,7 @@
 use super::filter::Pick;
 use super::model::{DecodingError, Sample, Slot, TokenModel};
 use super::plan::plan;
-use super::round::Rounds;
+use super::round::Samples;
 use super::settings::DecodingSettings;
 use std::collections::BTreeMap;
 
@@ -28,7 +28,7 @@ pub struct GeneratedTokens {
 pub struct StepTrace {
     pub modality: usize,
     pub step: usize,
-    /// The asked positions of each sample.
+    /// The target_positions positions of each sample.
     pub positions: Vec<Vec<u32>>,
     /// `[rows, vocabulary]`.
     pub conditional: Vec<f32>,
@@ -68,11 +68,11 @@ pub fn generate<M: TokenModel>(
     generate_checked(model, settings, samples, targets, seed, &mut checks)
 }
 
-/// [`generate`] once per seed. What the encoder makes of the given tokens, and answers that are asked for again, are shared.
+/// [`generate`] once per seed. What the encoder makes of the given tokens, and answers that are target_positions for again, are shared.
 ///
 /// # Errors
 /// As [`generate`].
-pub fn generate_rounds<M: TokenModel>(
+pub fn generate_samples<M: TokenModel>(
     model: &M,
     settings: &DecodingSettings,
     samples: &[Sample<'_>],
@@ -112,11 +112,15 @@ fn rounds<M: TokenModel>(
     };
     check_samples(model, samples, targets)?;
     let given: Vec<bool> = (0..first.slots.len())
-        .map(|m| samples.iter().any(|s| s.slots[m].is_given()))
+        .map(|m| samples.iter().any(|s| s.slots[m].is_known()))
         .collect();
-    let open: Vec<usize> = first.slots.iter().map(|slot| slot.open().len()).collect();
+    let open: Vec<usize> = first
+        .slots
+        .iter()
+        .map(|slot| slot.masked_positions().len())
+        .collect();
     let chains = plan(settings, model.modalities(), &given, &open, targets)?;
-    let mut rounds = Rounds::new(model, seeds.len());
+    let mut rounds = Samples::new(model, seeds.len());
     seeds
         .iter()
         .map(|&seed| rounds.next(seed, &chains, samples, checks))
@@ -148,7 +152,10 @@ fn check_samples<M: TokenModel>(
                     expected: modality.tokens,
                 });
             }
-            let (a, b) = (samples[0].slots[m].open().len(), slot.open().len());
+            let (a, b) = (
+                samples[0].slots[m].masked_positions().len(),
+                slot.masked_positions().len(),
+            );
             if a != b && targets.contains(&modality.name.as_str()) {
                 return Err(DecodingError::Uneven {
                     name: modality.name.clone(),
@@ -163,14 +170,14 @@ fn check_samples<M: TokenModel>(
 
 #[cfg(test)]
 mod tests {
-    use super::super::model::{Asked, TokenModality};
+    use super::super::model::{TargetPositions, TokenModality};
     use super::super::settings::{Order, Scheme, TargetSettings};
     use super::*;
     use rand::RngExt;
     use std::cell::Cell;
     use std::ops::Range;
 
-    /// Answers depend on which tokens are visible and on nothing else; counts its encoder passes.
+    /// DecoderOutput depend on which tokens are visible and on nothing else; counts its encoder passes.
     struct Toy {
         modalities: Vec<TokenModality>,
         encoded: Cell<usize>,
@@ -197,7 +204,7 @@ mod tests {
 
     impl TokenModel for Toy {
         type Context = ToyContext;
-        type Answers = (ToyContext, Asked);
+        type DecoderOutput = (ToyContext, TargetPositions);
 
         fn modalities(&self) -> &[TokenModality] {
             &self.modalities
@@ -230,14 +237,14 @@ mod tests {
         fn decode(
             &self,
             context: &ToyContext,
-            asked: &Asked,
-        ) -> Result<Self::Answers, DecodingError> {
-            Ok((context.clone(), asked.clone()))
+            target_positions: &TargetPositions,
+        ) -> Result<Self::DecoderOutput, DecodingError> {
+            Ok((context.clone(), target_positions.clone()))
         }
 
         fn logits(
             &self,
-            answers: &Self::Answers,
+            decoder_output: &Self::DecoderOutput,
             m: usize,
             rows: Range<usize>,
         ) -> Result<Vec<f32>, DecodingError> {
@@ -245,8 +252,10 @@ mod tests {
             let all: Vec<(u64, u32)> = answers
                 .0
                 .iter()
-                .zip(&answers.1)
-                .flat_map(|(&context, asked)| asked[m].iter().map(move |&p| (context, p)))
+                .zip(&decoder_output.1)
+                .flat_map(|(&context, target_positions)| {
+                    target_positions[m].iter().map(move |&p| (context, p))
+                })
                 .collect();
             Ok(all[rows]
                 .iter()
@@ -262,7 +271,7 @@ mod tests {
         let rgb = (0..8).map(|p| (id as u32 + p) % 16).collect();
         Sample {
             id,
-            slots: vec![Slot::given(rgb), Slot::unknown(12), Slot::unknown(21)],
+            slots: vec![Slot::input(rgb), Slot::masked(12), Slot::masked(21)],
         }
     }
 
@@ -363,7 +372,7 @@ mod tests {
         assert!(tokens.confidence.iter().all(|c| (0.0..=1.0).contains(c)));
         let empty = Sample {
             id: 0,
-            slots: vec![Slot::unknown(8), Slot::unknown(12), Slot::unknown(21)],
+            slots: vec![Slot::masked(8), Slot::masked(12), Slot::masked(21)],
         };
         let generated =
             generate(&toy(), &settings, &[empty], &["rgb", "body", "camera"], 0).unwrap();
@@ -410,13 +419,13 @@ mod tests {
             )
         };
         let mut partly = sample(1);
-        partly.slots[1] = Slot::given(vec![0; 12]);
+        partly.slots[1] = Slot::input(vec![0; 12]);
         assert!(matches!(
             run(&[sample(0), partly]),
             Err(DecodingError::Uneven { a: 12, b: 0, .. })
         ));
         let mut short = sample(1);
-        short.slots[1] = Slot::unknown(11);
+        short.slots[1] = Slot::masked(11);
         assert!(matches!(
             run(&[short]),
             Err(DecodingError::Length { found: 11, .. })
@@ -439,7 +448,7 @@ mod tests {
         let (single, several) = (toy(), toy());
         let samples = [sample(3)];
         let targets = ["camera", "body"];
-        let rounds = generate_rounds(&several, &settings, &samples, &targets, &[5, 6, 7]).unwrap();
+        let rounds = generate_samples(&several, &settings, &samples, &targets, &[5, 6, 7]).unwrap();
         for (seed, round) in [5, 6, 7].into_iter().zip(&rounds) {
             assert_eq!(
                 *round,

@@ -1,9 +1,9 @@
 //! MGET as a [`TokenModel`].
 
-use super::model::{Asked, DecodingError, Sample, Slot, TokenModality, TokenModel};
+use super::model::{DecodingError, Sample, Slot, TargetPositions, TokenModality, TokenModel};
 use crate::engine::Tensor;
 use crate::engine::parameters::to_host;
-use crate::mget::{Content, Context, Mget, Sequence, Visible};
+use crate::mget::{Content, Context, EncoderInput, Mget, Sequence};
 use std::ops::Range;
 
 /// A model with the list of its modalities.
@@ -33,14 +33,14 @@ impl<'m> MgetTokens<'m> {
 /// The decoder's output and which rows are whose.
 #[derive(Debug, Clone)]
 pub struct MgetAnswers {
-    /// `None` when nothing was asked.
+    /// `None` when nothing was target_positions.
     y_MD: Option<Tensor<2>>,
-    asked: Sequence,
+    target_positions: Sequence,
 }
 
 impl TokenModel for MgetTokens<'_> {
     type Context = Context;
-    type Answers = MgetAnswers;
+    type DecoderOutput = MgetAnswers;
 
     fn modalities(&self) -> &[TokenModality] {
         &self.modalities
@@ -69,7 +69,7 @@ impl TokenModel for MgetTokens<'_> {
                     .zip(hidden)
                     .zip(&self.modalities)
                     .map(|((slot, hidden), modality)| match slot {
-                        _ if *hidden || !slot.is_given() => Vec::new(),
+                        _ if *hidden || !slot.is_known() => Vec::new(),
                         Slot::Tokens { known, .. } => (0..known.len() as u32)
                             .filter(|&p| known[p as usize])
                             .collect(),
@@ -78,7 +78,7 @@ impl TokenModel for MgetTokens<'_> {
                     .collect()
             })
             .collect();
-        let visible = Visible::new(
+        let visible = EncoderInput::new(
             self.model.spec(),
             &contents,
             given.iter().map(Vec::as_slice),
@@ -87,9 +87,13 @@ impl TokenModel for MgetTokens<'_> {
         Ok(self.model.encode(&visible))
     }
 
-    fn decode(&self, context: &Context, asked: &Asked) -> Result<MgetAnswers, DecodingError> {
+    fn decode(
+        &self,
+        context: &Context,
+        target_positions: &TargetPositions,
+    ) -> Result<MgetAnswers, DecodingError> {
         for (m, modality) in self.modalities.iter().enumerate() {
-            let outside = asked
+            let outside = target_positions
                 .iter()
                 .flat_map(|sample| &sample[m])
                 .find(|&&p| p as usize >= modality.tokens);
@@ -98,24 +102,30 @@ impl TokenModel for MgetTokens<'_> {
                 return Err(DecodingError::Model(reason));
             }
         }
-        let asked = Sequence::new(self.modalities.len(), asked.iter().map(Vec::as_slice));
-        let y_MD = self.model.decode(context, &asked);
-        Ok(MgetAnswers { y_MD, asked })
+        let target_positions = Sequence::new(
+            self.modalities.len(),
+            target_positions.iter().map(Vec::as_slice),
+        );
+        let y_MD = self.model.decode(context, &target_positions);
+        Ok(MgetAnswers {
+            y_MD,
+            target_positions,
+        })
     }
 
     fn logits(
         &self,
-        answers: &MgetAnswers,
+        decoder_output: &MgetAnswers,
         modality: usize,
         rows: Range<usize>,
     ) -> Result<Vec<f32>, DecodingError> {
         let missing = || {
             DecodingError::Model(format!(
-                "rows {rows:?} of modality {modality} were not asked"
+                "rows {rows:?} of modality {modality} were not target_positions"
             ))
         };
         let own = answers
-            .asked
+            .target_positions
             .rows
             .get(modality)
             .and_then(|own| own.get(rows.clone()));
@@ -124,7 +134,7 @@ impl TokenModel for MgetTokens<'_> {
             ..Sequence::default()
         };
         part.rows[modality] = own.ok_or_else(missing)?.to_vec();
-        let y_MD = answers.y_MD.as_ref().ok_or_else(missing)?;
+        let y_MD = decoder_output.y_MD.as_ref().ok_or_else(missing)?;
         let logits = self
             .model
             .logits(y_MD, &part, modality)

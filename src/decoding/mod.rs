@@ -15,8 +15,8 @@ mod round;
 pub mod schedule;
 pub mod settings;
 
-pub use generate::{Generated, GeneratedTokens, generate, generate_rounds};
+pub use generate::{Generated, GeneratedTokens, generate, generate_samples};
 pub use mget::MgetTokens;
 pub use model::{DecodingError, Sample, Slot, TokenModality, TokenModel};
-pub use reconstructor::{Reconstructed, Reconstructor, ReconstructorError, Wish};
+pub use reconstructor::{GenerationRequest, Reconstructed, Reconstructor, ReconstructorError};
 pub use settings::DecodingSettings;

@@ -34,7 +34,7 @@ pub enum Slot<'a> {
 impl Slot<'_> {
     /// Nothing known of `tokens` tokens.
     #[must_use]
-    pub fn unknown(tokens: usize) -> Self {
+    pub fn masked(tokens: usize) -> Self {
         Self::Tokens {
             ids: vec![0; tokens],
             known: vec![false; tokens],
@@ -43,7 +43,7 @@ impl Slot<'_> {
 
     /// All tokens known.
     #[must_use]
-    pub fn given(ids: Vec<u32>) -> Self {
+    pub fn input(ids: Vec<u32>) -> Self {
         Self::Tokens {
             known: vec![true; ids.len()],
             ids,
@@ -52,7 +52,7 @@ impl Slot<'_> {
 
     /// Whether anything is known.
     #[must_use]
-    pub fn is_given(&self) -> bool {
+    pub fn is_known(&self) -> bool {
         match self {
             Self::Tokens { known, .. } => known.iter().any(|k| *k),
             Self::Pixels(content) => !matches!(content, Content::Absent),
@@ -61,7 +61,7 @@ impl Slot<'_> {
 
     /// Positions of unknown tokens, ascending; empty for raw video.
     #[must_use]
-    pub fn open(&self) -> Vec<u32> {
+    pub fn masked_positions(&self) -> Vec<u32> {
         match self {
             Self::Tokens { known, .. } => (0..known.len() as u32)
                 .filter(|&p| !known[p as usize])
@@ -71,17 +71,17 @@ impl Slot<'_> {
     }
 }
 
-/// Positions asked of every sample: `[samples][modalities][positions]`.
-pub type Asked = Vec<Vec<Vec<u32>>>;
+/// Positions target_positions of every sample: `[samples][modalities][positions]`.
+pub type TargetPositions = Vec<Vec<Vec<u32>>>;
 
 /// A masked model of tokens.
 pub trait TokenModel {
     /// What the encoder made of the known tokens.
     type Context;
-    /// What the decoder made of the asked positions, before the output matrices.
-    type Answers;
+    /// What the decoder made of the target_positions positions, before the output matrices.
+    type DecoderOutput;
 
-    /// Its modalities, in the order of every `slots` and `asked`.
+    /// Its modalities, in the order of every `slots` and `target_positions`.
     fn modalities(&self) -> &[TokenModality];
 
     /// Reads the known tokens of `samples`, without the modalities that `hidden` marks. It may be that nothing is left.
@@ -94,23 +94,23 @@ pub trait TokenModel {
         hidden: &[bool],
     ) -> Result<Self::Context, DecodingError>;
 
-    /// Answers for the asked positions. Positions of different modalities do not see each other.
+    /// DecoderOutput for the target_positions positions. Positions of different modalities do not see each other.
     ///
     /// # Errors
     /// When a position does not exist.
     fn decode(
         &self,
         context: &Self::Context,
-        asked: &Asked,
-    ) -> Result<Self::Answers, DecodingError>;
+        target_positions: &TargetPositions,
+    ) -> Result<Self::DecoderOutput, DecodingError>;
 
-    /// Logits `[rows, vocabulary]` of a range of the rows of one modality, samples in order, positions as asked.
+    /// Logits `[rows, vocabulary]` of a range of the rows of one modality, samples in order, positions as target_positions.
     ///
     /// # Errors
-    /// When the rows were not asked.
+    /// When the rows were not target_positions.
     fn logits(
         &self,
-        answers: &Self::Answers,
+        decoder_output: &Self::DecoderOutput,
         modality: usize,
         rows: Range<usize>,
     ) -> Result<Vec<f32>, DecodingError>;

@@ -4,14 +4,14 @@
 //! (`tokenizers/<modality>/`), and [`FILE`], which says what clips it takes and names the tokenizers by their bytes, so that a
 //! model and tokenizers that do not belong together are found before anything is decoded into nonsense.
 
-mod binding;
+mod manifest;
 
-pub use binding::Binding;
+pub use manifest::ModelManifest;
 
-use self::binding::{digest, not_a_model};
+use self::manifest::{digest, not_a_model};
 use super::{
     DecodingError, DecodingSettings, Generated, GeneratedTokens, MgetTokens, Sample, Slot,
-    generate_rounds,
+    generate_samples,
 };
 use crate::clip::{Clip, Signal};
 use crate::engine::Compute;
@@ -60,7 +60,7 @@ pub enum ReconstructorError {
     #[error("no modality `{name}` in this model; it has: {known}")]
     UnknownModality { name: String, known: String },
     #[error("clip `{clip}` has no {modality}, which the model is to be given")]
-    NotGiven { clip: String, modality: String },
+    MissingInput { clip: String, modality: String },
     #[error("clip `{clip}`: {reason}")]
     Clip { clip: String, reason: String },
     #[error(transparent)]
@@ -79,19 +79,19 @@ pub struct Reconstructor {
 
 /// What to generate, and how.
 #[derive(Debug, Clone)]
-pub struct Wish<'a> {
+pub struct GenerationRequest<'a> {
     /// Modalities that every clip has and the model sees; `rgb` gives raw video too where the model takes it, `pixels` raw video
     /// alone.
-    pub given: &'a [String],
+    pub inputs: &'a [String],
     /// Modalities to generate.
-    pub wanted: &'a [String],
+    pub targets: &'a [String],
     pub decoding: &'a DecodingSettings,
     pub seed: u64,
 }
 
 /// What the model sees of a batch of clips.
 #[derive(Default)]
-pub struct Seen<'a> {
+pub struct Conditioning<'a> {
     tokens: BTreeMap<&'a str, Vec<TokenGrid>>,
     pixels: Vec<Vec<f32>>,
 }
@@ -111,7 +111,7 @@ impl Reconstructor {
     /// # Errors
     /// When a part is missing, damaged, or another one than the model was trained on.
     pub fn open(folder: &Path, compute: &Compute) -> Result<Self, ReconstructorError> {
-        let binding = Binding::read(folder)?;
+        let binding = ModelManifest::read(folder)?;
         let model = Mget::open(folder, compute).map_err(|error| not_a_model(folder, error))?;
         let modalities: BTreeMap<String, Box<dyn Modality>> = modality::all(&binding.clips)
             .into_iter()
@@ -203,39 +203,39 @@ impl Reconstructor {
         &self,
         clips: &[Clip],
         ids: &[u64],
-        wish: &Wish<'_>,
+        request: &GenerationRequest<'_>,
     ) -> Result<Vec<Reconstructed>, ReconstructorError> {
-        let seen = self.see(clips, wish.given)?;
-        let generated = self.generate(&seen, ids, wish)?;
-        self.decode(clips, &generated, wish)
+        let conditioning = self.encode_inputs(clips, request.inputs)?;
+        let generated = self.generate(&conditioning, ids, request)?;
+        self.decode(clips, &generated, request)
     }
 
-    /// Generates the tokens of what is wanted, once per sample that is averaged; the middle of [`Reconstructor::reconstruct`].
+    /// Generates the tokens of what is targets, once per sample that is averaged; the middle of [`Reconstructor::reconstruct`].
     ///
     /// # Errors
     /// When a modality is unknown.
     pub fn generate(
         &self,
-        seen: &Seen<'_>,
+        conditioning: &Conditioning<'_>,
         ids: &[u64],
-        wish: &Wish<'_>,
+        request: &GenerationRequest<'_>,
     ) -> Result<Vec<Vec<Generated>>, ReconstructorError> {
         let samples: Vec<Sample<'_>> = ids
             .iter()
             .enumerate()
             .map(|(clip, &id)| Sample {
                 id,
-                slots: self.slots(seen, clip),
+                slots: self.slots(conditioning, clip),
             })
             .collect();
-        let targets: Vec<&str> = wish.wanted.iter().map(String::as_str).collect();
+        let targets: Vec<&str> = request.targets.iter().map(String::as_str).collect();
         let model = MgetTokens::new(&self.model);
-        let seeds: Vec<u64> = (0..wish.decoding.samples.max(1))
-            .map(|round| seed_of_round(wish.seed, round))
+        let seeds: Vec<u64> = (0..request.decoding.samples.max(1))
+            .map(|round| seed_of_round(request.seed, round))
             .collect();
-        Ok(generate_rounds(
+        Ok(generate_samples(
             &model,
-            wish.decoding,
+            request.decoding,
             &samples,
             &targets,
             &seeds,
@@ -250,7 +250,7 @@ impl Reconstructor {
         &self,
         clips: &[Clip],
         rounds: &[Vec<Generated>],
-        wish: &Wish<'_>,
+        request: &GenerationRequest<'_>,
     ) -> Result<Vec<Reconstructed>, ReconstructorError> {
         let mut made: Vec<Reconstructed> = clips
             .iter()
@@ -259,11 +259,11 @@ impl Reconstructor {
                 confidence: BTreeMap::new(),
             })
             .collect();
-        for name in wish.wanted {
+        for name in request.targets {
             let modality = self.modality(name)?;
             let tokenizer = &self.tokenizers[name];
             let mut mean = Mean::default();
-            for generated in rounds.iter().take(wish.decoding.samples_of(name)) {
+            for generated in rounds.iter().take(request.decoding.samples_of(name)) {
                 let own: Vec<&GeneratedTokens> = generated
                     .iter()
                     .filter_map(|g| g.targets.get(name))
@@ -327,12 +327,12 @@ impl Reconstructor {
     ///
     /// # Errors
     /// When a modality is unknown, or a clip lacks a given one.
-    pub fn see<'a>(
+    pub fn encode_inputs<'a>(
         &self,
         clips: &[Clip],
-        given: &'a [String],
-    ) -> Result<Seen<'a>, ReconstructorError> {
-        let mut seen = Seen::default();
+        inputs: &'a [String],
+    ) -> Result<Conditioning<'a>, ReconstructorError> {
+        let mut conditioning = Conditioning::default();
         for name in given {
             let takes_pixels = self.model.spec().index(PIXELS).is_some();
             if takes_pixels && (name == PIXELS || name == "rgb") {
@@ -341,27 +341,30 @@ impl Reconstructor {
                     .get("rgb")
                     .ok_or_else(|| self.unknown(name))?;
                 let floats = |signal: &Signal| signal.values.iter().copied().collect();
-                seen.pixels = signals(rgb.as_ref(), clips)?.iter().map(floats).collect();
+                conditioning.pixels = signals(rgb.as_ref(), clips)?.iter().map(floats).collect();
             }
             if takes_pixels && name == PIXELS {
                 continue;
             }
             let signals = signals(self.modality(name)?, clips)?;
-            seen.tokens
+            conditioning
+                .tokens
                 .insert(name, self.tokenizers[name].encode(&signals)?);
         }
-        Ok(seen)
+        Ok(conditioning)
     }
 
     /// One slot per modality of the model, for one clip.
-    fn slots<'a>(&self, seen: &'a Seen<'_>, clip: usize) -> Vec<Slot<'a>> {
-        let of = |slot: &ModalitySpec| match seen.tokens.get(slot.name.as_str()) {
-            Some(grids) => Slot::given(grids[clip].ids.clone()),
-            None if slot.vocabulary().is_none() => Slot::Pixels(match seen.pixels.get(clip) {
-                Some(values) if slot.name == PIXELS => Content::Floats(values),
-                _ => Content::Absent,
-            }),
-            None => Slot::unknown(slot.count()),
+    fn slots<'a>(&self, conditioning: &'a Conditioning<'_>, clip: usize) -> Vec<Slot<'a>> {
+        let of = |slot: &ModalitySpec| match conditioning.tokens.get(slot.name.as_str()) {
+            Some(grids) => Slot::input(grids[clip].ids.clone()),
+            None if slot.vocabulary().is_none() => {
+                Slot::Pixels(match conditioning.pixels.get(clip) {
+                    Some(values) if slot.name == PIXELS => Content::Floats(values),
+                    _ => Content::Absent,
+                })
+            }
+            None => Slot::masked(slot.count()),
         };
         self.model.spec().modalities.iter().map(of).collect()
     }
@@ -372,7 +375,7 @@ fn signals(modality: &dyn Modality, clips: &[Clip]) -> Result<Vec<Signal>, Recon
         let signal = modality
             .extract(clip)
             .map_err(|error| wrong_clip(clip, error))?;
-        signal.ok_or_else(|| ReconstructorError::NotGiven {
+        signal.ok_or_else(|| ReconstructorError::MissingInput {
             clip: clip.id.clone(),
             modality: modality.name().to_owned(),
         })
@@ -475,7 +478,7 @@ mod tests {
     #[test]
     fn a_folder_that_is_no_model_says_so() {
         let folder = tempfile::tempdir().unwrap();
-        let error = Binding::read(folder.path()).unwrap_err().to_string();
+        let error = ModelManifest::read(folder.path()).unwrap_err().to_string();
         assert!(error.contains("no model folder"), "{error}");
     }
 

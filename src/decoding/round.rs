@@ -2,7 +2,7 @@
 
 use super::filter::{Pick, pick};
 use super::generate::{Checks, Generated, GeneratedTokens, StepTrace};
-use super::model::{Asked, DecodingError, Sample, Slot, TokenModel};
+use super::model::{DecodingError, Sample, Slot, TargetPositions, TokenModel};
 use super::plan::{Chain, Group, Target};
 use super::settings::Scheme;
 use rand::RngExt;
@@ -20,22 +20,22 @@ struct State<'a> {
     untouched: bool,
 }
 
-/// Rounds of the same questions with different seeds.
-pub(super) struct Rounds<'m, M: TokenModel> {
+/// Samples of the same questions with different seeds.
+pub(super) struct Samples<'m, M: TokenModel> {
     model: &'m M,
     seed: u64,
     /// The encoder's view of what was given: the first step of every chain starts from it.
     given: Option<M::Context>,
-    /// Answers of the first round to questions about what was given: where all tokens are decided at once, every round has the
+    /// DecoderOutput of the first round to questions about what was given: where all tokens are decided at once, every round has the
     /// same questions.
-    answered: Vec<(Asked, Rc<M::Answers>)>,
+    answered: Vec<(TargetPositions, Rc<M::DecoderOutput>)>,
     keep: bool,
 }
 
 /// Logits held at a time, in numbers.
 const LOGITS: usize = 1 << 22;
 
-impl<'m, M: TokenModel> Rounds<'m, M> {
+impl<'m, M: TokenModel> Samples<'m, M> {
     pub(super) fn new(model: &'m M, rounds: usize) -> Self {
         Self {
             model,
@@ -92,26 +92,31 @@ impl<'m, M: TokenModel> Rounds<'m, M> {
         Ok(generated)
     }
 
-    /// Answers from what was given alone.
+    /// DecoderOutput from what was given alone.
     fn answers_to_given(
         &mut self,
         samples: &[Sample<'_>],
-        asked: &Asked,
+        target_positions: &TargetPositions,
         nothing_hidden: &[bool],
-    ) -> Result<Rc<M::Answers>, DecodingError> {
-        if let Some((_, answers)) = self.answered.iter().find(|(before, _)| before == asked) {
-            return Ok(Rc::clone(answers));
+    ) -> Result<Rc<M::DecoderOutput>, DecodingError> {
+        if let Some((_, decoder_output)) = self
+            .answered
+            .iter()
+            .find(|(before, _)| before == target_positions)
+        {
+            return Ok(Rc::clone(decoder_output));
         }
         let context = match self.given.take() {
             Some(context) => context,
             None => self.model.encode(samples, nothing_hidden)?,
         };
-        let answers = Rc::new(self.model.decode(&context, asked)?);
+        let decoder_output = Rc::new(self.model.decode(&context, target_positions)?);
         self.given = Some(context);
         if self.keep {
-            self.answered.push((asked.clone(), Rc::clone(&answers)));
+            self.answered
+                .push((target_positions.clone(), Rc::clone(&decoder_output)));
         }
-        Ok(answers)
+        Ok(decoder_output)
     }
 
     fn step(
@@ -126,20 +131,20 @@ impl<'m, M: TokenModel> Rounds<'m, M> {
             .iter()
             .filter(|t| step < t.counts.len())
             .collect();
-        let asked = self.asked(&active, step, state, checks);
+        let target_positions = self.target_positions(&active, step, state, checks);
         let guided =
             active.iter().any(|t| t.settings.guidance != 1.0) && group.hidden.iter().any(|h| *h);
 
         let nothing_hidden = vec![false; group.hidden.len()];
         let conditional = if state.untouched {
-            self.answers_to_given(&state.samples, &asked, &nothing_hidden)?
+            self.answers_to_given(&state.samples, &target_positions, &nothing_hidden)?
         } else {
             let context = self.model.encode(&state.samples, &nothing_hidden)?;
-            Rc::new(self.model.decode(&context, &asked)?)
+            Rc::new(self.model.decode(&context, &target_positions)?)
         };
         let unconditional = if guided {
             let context = self.model.encode(&state.samples, &group.hidden)?;
-            Some(self.model.decode(&context, &asked)?)
+            Some(self.model.decode(&context, &target_positions)?)
         } else {
             None
         };
@@ -147,68 +152,77 @@ impl<'m, M: TokenModel> Rounds<'m, M> {
             let guide = unconditional
                 .as_ref()
                 .filter(|_| target.settings.guidance != 1.0);
-            self.decide(target, step, &asked, &conditional, guide, state, checks)?;
+            self.decide(
+                target,
+                step,
+                &target_positions,
+                &conditional,
+                guide,
+                state,
+                checks,
+            )?;
         }
         state.untouched = false;
         Ok(())
     }
 
-    fn asked(
+    fn target_positions(
         &self,
         active: &[&Target],
         step: usize,
         state: &State<'_>,
         checks: &Checks<'_>,
-    ) -> Asked {
+    ) -> TargetPositions {
         let modalities = self.model.modalities();
-        let mut asked = vec![vec![Vec::new(); modalities.len()]; state.samples.len()];
+        let mut target_positions = vec![vec![Vec::new(); modalities.len()]; state.samples.len()];
         for target in active {
             let m = target.modality;
-            for (sample, asked) in state.samples.iter().zip(&mut asked) {
-                let open = sample.slots[m].open();
-                asked[m] = match (target.settings.scheme, checks.positions.get(&(m, step))) {
-                    (Scheme::Maskgit, _) => open,
-                    (Scheme::Roar, Some(positions)) => positions.clone(),
-                    (Scheme::Roar, None) => {
-                        let stream = format!("decoding.positions.{}", modalities[m].name);
-                        let mut rng =
-                            crate::random::stream(self.seed, &stream, step as u64, sample.id);
-                        let count = target.counts[step].min(open.len());
-                        let mut chosen: Vec<u32> = index::sample(&mut rng, open.len(), count)
-                            .iter()
-                            .map(|i| open[i])
-                            .collect();
-                        chosen.sort_unstable();
-                        chosen
-                    }
-                };
+            for (sample, target_positions) in state.samples.iter().zip(&mut target_positions) {
+                let open = sample.slots[m].masked_positions();
+                target_positions[m] =
+                    match (target.settings.scheme, checks.positions.get(&(m, step))) {
+                        (Scheme::Maskgit, _) => open,
+                        (Scheme::Roar, Some(positions)) => positions.clone(),
+                        (Scheme::Roar, None) => {
+                            let stream = format!("decoding.positions.{}", modalities[m].name);
+                            let mut rng =
+                                crate::random::stream(self.seed, &stream, step as u64, sample.id);
+                            let count = target.counts[step].min(open.len());
+                            let mut chosen: Vec<u32> = index::sample(&mut rng, open.len(), count)
+                                .iter()
+                                .map(|i| open[i])
+                                .collect();
+                            chosen.sort_unstable();
+                            chosen
+                        }
+                    };
             }
         }
-        asked
+        target_positions
     }
 
     fn decide(
         &self,
         target: &Target,
         step: usize,
-        asked: &Asked,
-        conditional: &M::Answers,
-        unconditional: Option<&M::Answers>,
+        target_positions: &TargetPositions,
+        conditional: &M::DecoderOutput,
+        unconditional: Option<&M::DecoderOutput>,
         state: &mut State<'_>,
         checks: &mut Checks<'_>,
     ) -> Result<(), DecodingError> {
         let m = target.modality;
         let modality = &self.model.modalities()[m];
         let vocabulary = modality.vocabulary.unwrap_or(1).max(1);
-        let rows: usize = asked.iter().map(|sample| sample[m].len()).sum();
+        let rows: usize = target_positions.iter().map(|sample| sample[m].len()).sum();
         let stream = format!("decoding.draw.{}", modality.name);
         let uniforms: Vec<f64> = state
             .samples
             .iter()
-            .zip(asked)
-            .flat_map(|(sample, asked)| {
+            .zip(target_positions)
+            .flat_map(|(sample, target_positions)| {
                 let mut rng = crate::random::stream(self.seed, &stream, step as u64, sample.id);
-                (0..asked[m].len()).map(move |_| rng.random::<f64>())
+                (0..target_positions[m].len()).map(move |_| rng.random::<f64>())
             })
             .collect();
         let filter = target.settings.filter(target.temperatures[step]);
@@ -216,7 +230,10 @@ impl<'m, M: TokenModel> Rounds<'m, M> {
         let mut trace = checks.trace.is_some().then(|| StepTrace {
             modality: m,
             step,
-            positions: asked.iter().map(|sample| sample[m].clone()).collect(),
+            positions: target_positions
+                .iter()
+                .map(|sample| sample[m].clone())
+                .collect(),
             conditional: Vec::new(),
             unconditional: Vec::new(),
             combined: Vec::new(),
@@ -232,8 +249,8 @@ impl<'m, M: TokenModel> Rounds<'m, M> {
             if let Some(trace) = &mut trace {
                 trace.conditional.extend_from_slice(&logits);
             }
-            if let Some(answers) = unconditional {
-                let without = self.model.logits(answers, m, range.clone())?;
+            if let Some(decoder_output) = unconditional {
+                let without = self.model.logits(decoder_output, m, range.clone())?;
                 for (with, without) in logits.iter_mut().zip(&without) {
                     *with = without + guidance * (*with - without);
                 }
@@ -258,12 +275,14 @@ impl<'m, M: TokenModel> Rounds<'m, M> {
         }
 
         let mut first = 0;
-        for (position, (sample, asked)) in state.samples.iter_mut().zip(asked).enumerate() {
-            let own = &picks[first..first + asked[m].len()];
-            first += asked[m].len();
+        for (position, (sample, target_positions)) in
+            state.samples.iter_mut().zip(target_positions).enumerate()
+        {
+            let own = &picks[first..first + target_positions[m].len()];
+            first += target_positions[m].len();
             let chosen = match target.settings.scheme {
                 Scheme::Roar => (0..own.len()).collect(),
-                Scheme::Maskgit => surest(own, &asked[m], target.counts[step]),
+                Scheme::Maskgit => surest(own, &target_positions[m], target.counts[step]),
             };
             let Slot::Tokens { ids, known } = &mut sample.slots[m] else {
                 continue;
@@ -274,7 +293,7 @@ impl<'m, M: TokenModel> Rounds<'m, M> {
                 .or_insert_with(|| vec![1.0; ids.len()]);
             let mut selected: Vec<u32> = Vec::with_capacity(chosen.len());
             for row in chosen {
-                let place = asked[m][row] as usize;
+                let place = target_positions[m][row] as usize;
                 ids[place] = own[row].token;
                 known[place] = true;
                 confidence[place] = own[row].certainty;

@@ -1,6 +1,6 @@
 //! Decoding as registry entries write it: `paper`, `release`, `fast`, or anyone's own.
 
-use super::filter::{Draw, Filter, TopK};
+use super::filter::{Filter, Sampling, TopK};
 use super::schedule::{TemperatureSchedule, TokenSchedule};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -47,7 +47,7 @@ pub struct TargetSettings {
     #[schemars(range(min = 0.0, max = 1.0))]
     pub top_p: f64,
     pub top_k: TopK,
-    pub draw: Draw,
+    pub draw: Sampling,
 }
 
 impl Default for TargetSettings {
@@ -61,7 +61,7 @@ impl Default for TargetSettings {
             guidance: 2.0,
             top_p: 0.8,
             top_k: TopK::Off,
-            draw: Draw::Random,
+            draw: Sampling::Random,
         }
     }
 }
@@ -105,7 +105,7 @@ pub struct TargetChanges {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub top_k: Option<TopK>,
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub draw: Option<Draw>,
+    pub draw: Option<Sampling>,
     /// How many of the samples are decoded for the mean; fewer for video, whose decoding takes longest.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schemars(range(min = 1))]

@@ -43,7 +43,7 @@ impl<'a> Initialise<'a> {
 
     /// A model whose values will all be loaded from a file.
     #[must_use]
-    pub fn to_load(compute: &'a Compute) -> Self {
+    pub fn empty(compute: &'a Compute) -> Self {
         Self {
             compute,
             values: Fill::Zeros,
@@ -53,7 +53,7 @@ impl<'a> Initialise<'a> {
 
     /// A model that is only looked at: names, shapes and counts, no memory.
     #[must_use]
-    pub fn planned(compute: &'a Compute) -> Self {
+    pub fn meta(compute: &'a Compute) -> Self {
         Self {
             compute,
             values: Fill::Nothing,
@@ -140,7 +140,7 @@ impl<'a> Initialise<'a> {
     /// Given values that no optimizer changes.
     #[must_use]
     pub fn fixed(&self, shape: &[usize], values: impl FnOnce() -> Vec<f32>) -> Parameter {
-        self.parameter(Kind::Fixed, shape, |_| values())
+        self.parameter(Kind::Buffer, shape, |_| values())
     }
 }
 

@@ -8,7 +8,7 @@
 //! * [`weights`]: named arrays on the host and the safetensors files they live in;
 //! * [`initialise`]: where the numbers of a new model come from;
 //! * [`ops`]: linear, layer norm, attention over packed segments, GELU, SwiGLU, cross-entropy, convolution and frame norm of
-//!   video. On the CPU each is one fused operation with a hand-written backward; on other back ends it is composed of the
+//!   video. On the CPU each is one fused operation with a hand-written backward; on other back ends it is unfused of the
 //!   library's own operations. Nearest code is a search on the host; embedding is the library's select everywhere;
 //! * [`gradients`]: gradients by parameter name, their global norm.
 

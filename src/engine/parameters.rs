@@ -46,7 +46,7 @@ impl Parameter {
 
     /// A parameter without values: for counting and planning.
     #[must_use]
-    pub fn planned(kind: Kind, shape: &[usize]) -> Self {
+    pub fn meta(kind: Kind, shape: &[usize]) -> Self {
         Self {
             shape: shape.to_vec(),
             kind,
@@ -403,7 +403,7 @@ mod tests {
         let leaf = |value: f32, table: bool| Leaf {
             weight: Parameter::new(Kind::Trainable, vec![value; 6], &[2, 3], compute.device()),
             table: table
-                .then(|| Parameter::new(Kind::Fixed, vec![value; 2], &[2], compute.device())),
+                .then(|| Parameter::new(Kind::Buffer, vec![value; 2], &[2], compute.device())),
         };
         Tree {
             blocks: vec![leaf(1.0, true), leaf(2.0, false)],

@@ -2,8 +2,8 @@
 
 use super::columns::Column;
 use super::published::Published;
+use super::row_scores::{AlignedScores, RowScores, add_differences};
 use super::scores::{FLOOR, Scores};
-use super::side::{On, Side, add_differences};
 use super::statistics::{Over, RESAMPLES};
 use super::table::{Cell, Row, RowKind, Table};
 use super::verdict;
@@ -12,7 +12,7 @@ use std::collections::BTreeSet;
 
 /// One row to be: an arm, a run, another system. Several scores are the same thing under several seeds.
 #[derive(Debug, Clone)]
-pub struct Entrant {
+pub struct Method {
     pub label: String,
     pub seeds: Vec<Scores>,
 }
@@ -87,7 +87,7 @@ pub enum CompareError {
 /// When there is nothing to compare, a name is unknown, or two entrants share no clip.
 pub fn compare(
     title: &str,
-    entrants: &[Entrant],
+    entrants: &[Method],
     settings: &CompareSettings,
     published: Option<&Published>,
 ) -> Result<Table, CompareError> {
@@ -107,9 +107,9 @@ pub fn compare(
             )?),
         };
     let common = common_clips(first, entrants)?;
-    let sides: Vec<Side> = entrants
+    let sides: Vec<RowScores> = entrants
         .iter()
-        .map(|entrant| Side {
+        .map(|entrant| RowScores {
             sets: entrant
                 .seeds
                 .iter()
@@ -135,7 +135,7 @@ pub fn compare(
         // They see only the truth, so any entrant's will do; the tokenizer floor is an entrant's own.
         let trivial = first.seeds[0].baselines.iter();
         for (name, set) in trivial.filter(|(name, _)| *name != FLOOR) {
-            let side = Side {
+            let side = RowScores {
                 sets: vec![On::of(&first.seeds[0], set, &common)],
             };
             let row = Row {
@@ -167,7 +167,7 @@ pub fn compare(
 
 /// The tokenizer floors: one row for all entrants that share their tokenizers, named after them where not all do.
 fn floors<'a>(
-    entrants: &'a [Entrant],
+    entrants: &'a [Method],
     columns: &[Column],
     common: &[String],
     settings: &IntervalSettings,
@@ -176,7 +176,7 @@ fn floors<'a>(
     for entrant in entrants {
         let of = |scores: &'a Scores| Some(On::of(scores, scores.baselines.get(FLOOR)?, common));
         let sets: Vec<On> = entrant.seeds.iter().filter_map(of).collect();
-        let side = Side { sets };
+        let side = RowScores { sets };
         let cells: Vec<Cell> = columns.iter().map(|c| side.cell(c, settings)).collect();
         if cells.iter().all(|cell| cell.value.is_none()) {
             continue;
@@ -210,7 +210,7 @@ fn floors<'a>(
     found.into_iter().map(row).collect()
 }
 
-fn columns(entrants: &[Entrant], wanted: &[String]) -> Result<Vec<Column>, CompareError> {
+fn columns(entrants: &[Method], wanted: &[String]) -> Result<Vec<Column>, CompareError> {
     let mut all: Vec<Column> = Vec::new();
     for set in entrants.iter().flat_map(|e| &e.seeds).map(|s| &s.own) {
         for column in set
@@ -246,7 +246,7 @@ fn columns(entrants: &[Entrant], wanted: &[String]) -> Result<Vec<Column>, Compa
 }
 
 /// Clips that every scores file has, in the order of the first.
-fn common_clips(first: &Entrant, entrants: &[Entrant]) -> Result<Vec<String>, CompareError> {
+fn common_clips(first: &Method, entrants: &[Method]) -> Result<Vec<String>, CompareError> {
     let mut common = first.seeds[0].clips.clone();
     for entrant in entrants {
         for scores in &entrant.seeds {
@@ -278,7 +278,7 @@ fn intervals(settings: &IntervalSettings) -> String {
 }
 
 fn notes(
-    entrants: &[Entrant],
+    entrants: &[Method],
     settings: &CompareSettings,
     common: &[String],
     published: Option<&Published>,
@@ -354,11 +354,11 @@ mod tests {
     #[test]
     fn a_shift_that_the_intervals_hide_is_found_in_the_paired_difference() {
         let entrants = [
-            Entrant {
+            Method {
                 label: "full".into(),
                 seeds: vec![scores(1, 0..60, 0.0), scores(2, 0..60, 0.0)],
             },
-            Entrant {
+            Method {
                 label: "uniform".into(),
                 seeds: vec![scores(3, 10..60, 5.0), scores(4, 10..60, 5.0)],
             },
@@ -412,12 +412,12 @@ mod tests {
                 floor: None,
                 unavailable: None,
             });
-            Entrant {
+            Method {
                 label: label.into(),
                 seeds: vec![own],
             }
         };
-        let cells = |entrants: &[Entrant]| -> Vec<(Option<f64>, Option<String>)> {
+        let cells = |entrants: &[Method]| -> Vec<(Option<f64>, Option<String>)> {
             let table = compare("", entrants, &CompareSettings::default(), None).unwrap();
             let cells = table.rows.into_iter().map(|row| row.cells[1].clone());
             cells.map(|cell| (cell.value, cell.reason)).collect()
@@ -441,12 +441,12 @@ mod tests {
                 let set = scores(2, 0..9, shift).own;
                 own.baselines.insert(FLOOR.to_owned(), set);
             }
-            Entrant {
+            Method {
                 label: label.into(),
                 seeds: vec![own],
             }
         };
-        let rows = |entrants: &[Entrant]| -> Vec<String> {
+        let rows = |entrants: &[Method]| -> Vec<String> {
             let table = compare("", entrants, &CompareSettings::default(), None).unwrap();
             let floors = table.rows.iter().filter(|r| r.kind == RowKind::Baseline);
             floors.map(|row| row.label.clone()).collect()
@@ -466,7 +466,7 @@ mod tests {
 
     #[test]
     fn what_cannot_be_compared_says_so() {
-        let entrant = |label: &str, clips| Entrant {
+        let entrant = |label: &str, clips| Method {
             label: label.into(),
             seeds: vec![scores(0, clips, 0.0)],
         };
@@ -492,7 +492,7 @@ mod tests {
 
     #[test]
     fn one_clip_has_a_value_and_no_interval() {
-        let one = Entrant {
+        let one = Method {
             label: "a".into(),
             seeds: vec![scores(0, 0..1, 0.0)],
         };

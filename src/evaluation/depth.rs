@@ -3,7 +3,7 @@
 //! The space of the alignment is part of the metric's name: `abs_rel@depth` fits depth, `abs_rel@disparity` its inverse. They
 //! are different numbers and must never be compared with each other.
 
-use super::outcome::{Refusal, mean};
+use super::outcome::{MetricError, mean};
 use ndarray::{ArrayView3, Zip};
 
 /// Where scale and shift are fitted.
@@ -53,9 +53,9 @@ pub fn depth_errors<T: Copy + Into<f64>>(
     mask: Option<ArrayView3<bool>>,
     space: Space,
     d_max: Option<f64>,
-) -> Result<DepthErrors, Refusal> {
+) -> Result<DepthErrors, MetricError> {
     if pred.dim() != gt.dim() || mask.is_some_and(|m| m.dim() != gt.dim()) {
-        return Err(Refusal::Shape {
+        return Err(MetricError::Shape {
             field: "depth",
             found: pred.shape().to_vec(),
             expected: gt.shape().to_vec(),
@@ -98,7 +98,7 @@ fn scored_pixels<T: Copy + Into<f64>>(
     gt: ArrayView3<T>,
     mask: Option<ArrayView3<bool>>,
     d_max: Option<f64>,
-) -> Result<Vec<(f64, f64)>, Refusal> {
+) -> Result<Vec<(f64, f64)>, MetricError> {
     let far = d_max.unwrap_or(f64::INFINITY);
     let mut pixels = Vec::with_capacity(gt.len());
     let mut refused = false;
@@ -131,7 +131,7 @@ fn scored_pixels<T: Copy + Into<f64>>(
                     && g < far
             })
             .map_or(vec![], |((t, y, x), _)| vec![t, y, x]);
-        return Err(Refusal::NotFinite {
+        return Err(MetricError::NotFinite {
             field: "depth prediction",
             position,
         });

@@ -3,7 +3,7 @@
 use super::baselines::{Means, image_centre};
 use super::columns::{Column, declared};
 use super::motion::{KinScores, frechet_distance, kin_scores, mean_cosine};
-use super::outcome::{Outcome, Refusal};
+use super::outcome::{MetricError, Outcome};
 use super::score_clip::{ClipScore, score_clip, still_camera};
 use super::scores::{ColumnScores, FLOOR, FORMAT, ScoreSet, Scores, SetScore};
 use super::suite::{Suite, UnknownMetric};
@@ -56,9 +56,9 @@ pub enum EvaluationError {
     #[error("clip `{clip}`: {error}")]
     Load { clip: String, error: LoadError },
     #[error("clip `{clip}`: refused: {refusal}")]
-    Refused { clip: String, refusal: Refusal },
+    Refused { clip: String, refusal: MetricError },
     #[error("motion embeddings: {0}")]
-    Embeddings(Refusal),
+    Embeddings(MetricError),
     #[error("none of the {truth} clips has a prediction; do the clip ids agree (`{example}`)?")]
     NoOverlap { truth: usize, example: String },
     #[error("interrupted")]

@@ -1,6 +1,6 @@
 //! Gaze error in normalised image coordinates (Sec. 5): MSE, mean distance, and the image centre as the baseline.
 
-use super::outcome::{Refusal, mean};
+use super::outcome::{MetricError, mean};
 use ndarray::{ArrayView1, ArrayView2};
 
 /// Ground truth outside these limits on either axis is not scored; the limits themselves are.
@@ -27,9 +27,9 @@ pub fn gaze_errors<T: Copy + Into<f64>>(
     pred: ArrayView2<T>,
     gt: ArrayView2<T>,
     valid: Option<ArrayView1<bool>>,
-) -> Result<GazeErrors, Refusal> {
+) -> Result<GazeErrors, MetricError> {
     if pred.dim() != gt.dim() || gt.ncols() != 2 || valid.is_some_and(|v| v.len() != gt.nrows()) {
-        return Err(Refusal::Shape {
+        return Err(MetricError::Shape {
             field: "gaze",
             found: pred.shape().to_vec(),
             expected: gt.shape().to_vec(),
@@ -45,7 +45,7 @@ pub fn gaze_errors<T: Copy + Into<f64>>(
         }
         let guess: [f64; 2] = [pred[(t, 0)].into(), pred[(t, 1)].into()];
         if !guess.iter().all(|c| c.is_finite()) {
-            return Err(Refusal::NotFinite {
+            return Err(MetricError::NotFinite {
                 field: "gaze prediction",
                 position: vec![t],
             });

@@ -7,7 +7,7 @@
 //! | GA | one similarity for the clip | valid (frame, joint) |
 //! | PA | one similarity per frame | joints, then frames |
 
-use super::outcome::{Outcome, Refusal, mean};
+use super::outcome::{MetricError, Outcome, mean};
 use crate::geometry::alignment::{Freedom, align};
 use nalgebra::Vector3;
 use ndarray::{ArrayView1, ArrayView2, ArrayView3, Axis};
@@ -93,14 +93,14 @@ pub fn joint_errors<T: Copy + Into<f64>>(
     gt: ArrayView3<T>,
     valid: Valid,
     root: usize,
-) -> Result<JointErrors, Refusal> {
+) -> Result<JointErrors, MetricError> {
     let (frames, joints, axes) = gt.dim();
     if pred.dim() != gt.dim()
         || axes != 3
         || !valid.fits(frames, joints)
         || (joints > 0 && root >= joints)
     {
-        return Err(Refusal::Shape {
+        return Err(MetricError::Shape {
             field: "joints",
             found: pred.shape().to_vec(),
             expected: gt.shape().to_vec(),
@@ -209,7 +209,7 @@ pub fn pair_of_hands(hands: [Outcome; 2], mode: HandMode) -> Outcome {
 pub fn reconstruction_mm<T: Copy + Into<f64>>(
     pred: ArrayView3<T>,
     gt: ArrayView3<T>,
-) -> Result<Option<f64>, Refusal> {
+) -> Result<Option<f64>, MetricError> {
     Ok(joint_errors(pred, gt, Valid::All, 0)?.mpjpe)
 }
 
@@ -223,12 +223,12 @@ fn finite<T: Copy + Into<f64>>(
     frame: usize,
     joint: usize,
     field: &'static str,
-) -> Result<Vector3<f64>, Refusal> {
+) -> Result<Vector3<f64>, MetricError> {
     let point = point(joints, frame, joint);
     if point.iter().all(|c| c.is_finite()) {
         Ok(point)
     } else {
-        Err(Refusal::NotFinite {
+        Err(MetricError::NotFinite {
             field,
             position: vec![frame, joint],
         })
@@ -285,7 +285,7 @@ mod tests {
         let refused = joint_errors(pred.view(), gt.view(), Valid::All, 0).unwrap_err();
         assert_eq!(
             refused,
-            Refusal::NotFinite {
+            MetricError::NotFinite {
                 field: "prediction",
                 position: vec![4, 3]
             }

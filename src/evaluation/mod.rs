@@ -29,11 +29,11 @@ pub mod motion;
 pub mod outcome;
 pub mod published;
 pub mod render;
+mod row_scores;
 pub mod runtime;
 pub mod sample;
 mod score_clip;
 pub mod scores;
-mod side;
 pub mod statistics;
 pub mod suite;
 pub mod table;
@@ -42,4 +42,4 @@ pub mod trajectory;
 pub mod tum;
 mod verdict;
 
-pub use outcome::{Outcome, Refusal};
+pub use outcome::{MetricError, Outcome};

@@ -3,7 +3,7 @@
 //! The paper embeds with TMR, whose weights a user brings; `kin_fid` and `kin_cos` need no weights. They rest on a kinematic
 //! descriptor and are never called FID: the two are different numbers.
 
-use super::outcome::{Refusal, mean};
+use super::outcome::{MetricError, mean};
 use nalgebra::DMatrix;
 use ndarray::{Array1, Array2, ArrayView2, ArrayView3, Axis, Zip, s};
 
@@ -18,7 +18,7 @@ pub fn frechet_distance(
     a: ArrayView2<f64>,
     b: ArrayView2<f64>,
     normalize: bool,
-) -> Result<Option<f64>, Refusal> {
+) -> Result<Option<f64>, MetricError> {
     check_widths(&a, &b)?;
     let (a, b) = if normalize {
         (unit_rows(a)?, unit_rows(b)?)
@@ -58,7 +58,7 @@ fn reduced(x: &Array2<f64>) -> DMatrix<f64> {
 ///
 /// # Errors
 /// When the shapes differ, a value is not finite, or a row has length zero.
-pub fn mean_cosine(a: ArrayView2<f64>, b: ArrayView2<f64>) -> Result<Option<f64>, Refusal> {
+pub fn mean_cosine(a: ArrayView2<f64>, b: ArrayView2<f64>) -> Result<Option<f64>, MetricError> {
     Ok(mean(cosines(a, b)?))
 }
 
@@ -72,10 +72,10 @@ pub fn score01(cosine: f64) -> f64 {
 ///
 /// # Errors
 /// As [`mean_cosine`].
-pub fn cosines(a: ArrayView2<f64>, b: ArrayView2<f64>) -> Result<Vec<f64>, Refusal> {
+pub fn cosines(a: ArrayView2<f64>, b: ArrayView2<f64>) -> Result<Vec<f64>, MetricError> {
     check_widths(&a, &b)?;
     if a.nrows() != b.nrows() {
-        return Err(Refusal::Shape {
+        return Err(MetricError::Shape {
             field: "embeddings",
             found: a.shape().to_vec(),
             expected: b.shape().to_vec(),
@@ -88,9 +88,9 @@ pub fn cosines(a: ArrayView2<f64>, b: ArrayView2<f64>) -> Result<Vec<f64>, Refus
         .collect())
 }
 
-fn check_widths(a: &ArrayView2<f64>, b: &ArrayView2<f64>) -> Result<(), Refusal> {
+fn check_widths(a: &ArrayView2<f64>, b: &ArrayView2<f64>) -> Result<(), MetricError> {
     if a.ncols() != b.ncols() {
-        return Err(Refusal::Shape {
+        return Err(MetricError::Shape {
             field: "embeddings",
             found: a.shape().to_vec(),
             expected: b.shape().to_vec(),
@@ -98,7 +98,7 @@ fn check_widths(a: &ArrayView2<f64>, b: &ArrayView2<f64>) -> Result<(), Refusal>
     }
     for x in [a, b] {
         if let Some(((row, column), _)) = x.indexed_iter().find(|(_, v)| !v.is_finite()) {
-            return Err(Refusal::NotFinite {
+            return Err(MetricError::NotFinite {
                 field: "embedding",
                 position: vec![row, column],
             });
@@ -107,12 +107,12 @@ fn check_widths(a: &ArrayView2<f64>, b: &ArrayView2<f64>) -> Result<(), Refusal>
     Ok(())
 }
 
-fn unit_rows(x: ArrayView2<f64>) -> Result<Array2<f64>, Refusal> {
+fn unit_rows(x: ArrayView2<f64>) -> Result<Array2<f64>, MetricError> {
     let mut x = x.to_owned();
     for (row, mut lane) in x.outer_iter_mut().enumerate() {
         let length = lane.dot(&lane).sqrt();
         if length == 0.0 {
-            return Err(Refusal::ZeroEmbedding { row });
+            return Err(MetricError::ZeroEmbedding { row });
         }
         lane /= length;
     }
@@ -200,9 +200,9 @@ pub struct KinScores {
 ///
 /// # Errors
 /// When the shapes differ, a value is not finite, or a clip sits exactly at the truth's mean (it has no direction).
-pub fn kin_scores(pred: ArrayView2<f64>, gt: ArrayView2<f64>) -> Result<KinScores, Refusal> {
+pub fn kin_scores(pred: ArrayView2<f64>, gt: ArrayView2<f64>) -> Result<KinScores, MetricError> {
     if pred.dim() != gt.dim() {
-        return Err(Refusal::Shape {
+        return Err(MetricError::Shape {
             field: "descriptors",
             found: pred.shape().to_vec(),
             expected: gt.shape().to_vec(),

@@ -71,7 +71,7 @@ impl<'de> Deserialize<'de> for Outcome {
 
 /// Why a metric refuses to score. A refusal ends the evaluation: silently skipped garbage would look like a good score.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum Refusal {
+pub enum MetricError {
     #[error("{field}: not finite at {position:?} on a scored element")]
     NotFinite {
         field: &'static str,

@@ -5,7 +5,7 @@ use super::depth::{DepthErrors, Space, depth_errors};
 use super::gaze::{GazeErrors, gaze_errors};
 use super::joints::{HandMode, JointErrors, Valid, joint_errors, pair_of_hands};
 use super::motion::kinematic_descriptor;
-use super::outcome::{Outcome, Refusal, mean};
+use super::outcome::{MetricError, Outcome, mean};
 use super::trajectory::{Pose, TrajectoryErrors, masked_trajectory_errors, trajectory_errors};
 use crate::clip::{CameraTrack, Clip, Depth, JointTrack, Rgb, Signal};
 use crate::geometry::alignment::Freedom;
@@ -39,7 +39,7 @@ pub(crate) fn score_clip(
     depth_max: Option<f64>,
     truth: &Clip,
     prediction: &Clip,
-) -> Result<ClipScore, Refusal> {
+) -> Result<ClipScore, MetricError> {
     let mut score = ClipScore::default();
     let wanted = |modalities: &[&str]| columns.iter().any(|c| modalities.contains(&c.modality()));
     let missing = &mut score.missing;
@@ -181,7 +181,9 @@ fn both<'a, T>(
     Some((truth, prediction.as_ref()?))
 }
 
-fn track_errors((truth, prediction): (&JointTrack, &JointTrack)) -> Result<JointErrors, Refusal> {
+fn track_errors(
+    (truth, prediction): (&JointTrack, &JointTrack),
+) -> Result<JointErrors, MetricError> {
     let valid = Valid::Joints(truth.valid.view());
     joint_errors(prediction.joints.view(), truth.joints.view(), valid, ROOT)
 }
@@ -228,7 +230,7 @@ struct CameraScore {
 }
 
 impl CameraScore {
-    fn of(truth: &CameraTrack, prediction: &CameraTrack) -> Result<Self, Refusal> {
+    fn of(truth: &CameraTrack, prediction: &CameraTrack) -> Result<Self, MetricError> {
         let count = truth.T_world_camera.len();
         let mut guess = prediction.T_world_camera.clone();
         let resampled = guess.len() != count && prediction.rate != truth.rate && !guess.is_empty();
@@ -287,7 +289,7 @@ impl CameraScore {
 }
 
 /// RTE and RRE of a camera that never moves, on the true trajectory; degenerate where the truth is.
-pub(crate) fn still_camera(columns: &[Column], truth: &Clip) -> Result<Vec<Outcome>, Refusal> {
+pub(crate) fn still_camera(columns: &[Column], truth: &Clip) -> Result<Vec<Outcome>, MetricError> {
     let errors = match &truth.camera {
         None => TrajectoryErrors::default(),
         Some(track) => {
@@ -337,7 +339,7 @@ impl DepthScore {
         depth_max: Option<f64>,
         truth: &Depth,
         prediction: &Depth,
-    ) -> Result<Self, Refusal> {
+    ) -> Result<Self, MetricError> {
         let gt = on_grid(&truth.metres, prediction.metres.dim());
         let mut by_space = Vec::new();
         for (name, space) in Self::SPACES {
@@ -401,9 +403,9 @@ fn psnr(truth: &Rgb, prediction: &Rgb) -> Option<f64> {
 }
 
 /// Root mean square error over the valid elements of a declared modality.
-fn declared_rmse(truth: &Signal, prediction: &Signal) -> Result<Option<f64>, Refusal> {
+fn declared_rmse(truth: &Signal, prediction: &Signal) -> Result<Option<f64>, MetricError> {
     if truth.values.shape() != prediction.values.shape() {
-        return Err(Refusal::Shape {
+        return Err(MetricError::Shape {
             field: "declared signal",
             found: prediction.values.shape().to_vec(),
             expected: truth.values.shape().to_vec(),
@@ -417,7 +419,7 @@ fn declared_rmse(truth: &Signal, prediction: &Signal) -> Result<Option<f64>, Ref
             continue;
         }
         if !p.is_finite() {
-            return Err(Refusal::NotFinite {
+            return Err(MetricError::NotFinite {
                 field: "declared signal",
                 position: vec![i / channels, i % channels],
             });
@@ -468,7 +470,7 @@ mod tests {
         lose(&mut prediction, 31);
         assert!(matches!(
             score(&truth, &prediction),
-            Err(Refusal::NotFinite { .. })
+            Err(MetricError::NotFinite { .. })
         ));
         // At half the rate, pose 10 is needed for samples 19, 20 and 21.
         let mut prediction = clip(30, 15.0);

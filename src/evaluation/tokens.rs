@@ -1,6 +1,6 @@
 //! How much of a codebook a tokenizer uses, over a whole split (Supp. A).
 
-use super::outcome::Refusal;
+use super::outcome::MetricError;
 
 /// Use of a codebook of `size` codes.
 #[derive(Debug, Clone, PartialEq, Default, serde::Serialize)]
@@ -31,12 +31,12 @@ impl CodeCounts {
 
     /// # Errors
     /// When a code is negative or not below the size.
-    pub fn add(&mut self, code: i64) -> Result<(), Refusal> {
+    pub fn add(&mut self, code: i64) -> Result<(), MetricError> {
         let size = self.counts.len();
         let slot = usize::try_from(code)
             .ok()
             .and_then(|c| self.counts.get_mut(c));
-        *slot.ok_or(Refusal::CodeOutside { code, size })? += 1;
+        *slot.ok_or(MetricError::CodeOutside { code, size })? += 1;
         Ok(())
     }
 
@@ -68,7 +68,7 @@ impl CodeCounts {
 pub fn codebook_use(
     codes: impl IntoIterator<Item = i64>,
     size: usize,
-) -> Result<CodebookUse, Refusal> {
+) -> Result<CodebookUse, MetricError> {
     let mut counts = CodeCounts::new(size);
     for code in codes {
         counts.add(code)?;

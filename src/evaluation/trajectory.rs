@@ -3,7 +3,7 @@
 //! With `P_i` the aligned estimate and `Q_i` the reference, `ATE_i = |pos P_i - pos Q_i|`, and for pairs `delta` samples apart
 //! `E = (Q_i⁻¹ Q_{i+Δ})⁻¹ (P_i⁻¹ P_{i+Δ})`, `RTE = |trans E|`, `RRE = angle(rot E)`. RRE does not depend on the alignment.
 
-use super::outcome::{Outcome, Refusal, mean, rms};
+use super::outcome::{MetricError, Outcome, mean, rms};
 use crate::geometry::alignment::{Freedom, Similarity, align};
 use nalgebra::{Isometry3, Matrix3, Vector3};
 use ndarray::ArrayView3;
@@ -52,10 +52,10 @@ impl Pose {
 pub fn poses_from_matrices(
     matrices: ArrayView3<f64>,
     field: &'static str,
-) -> Result<Vec<Pose>, Refusal> {
+) -> Result<Vec<Pose>, MetricError> {
     let (count, rows, columns) = matrices.dim();
     if (rows, columns) != (4, 4) {
-        return Err(Refusal::Shape {
+        return Err(MetricError::Shape {
             field,
             found: vec![count, rows, columns],
             expected: vec![count, 4, 4],
@@ -73,9 +73,9 @@ pub fn poses_from_matrices(
         .collect()
 }
 
-fn check(pose: &Pose, index: usize, field: &'static str) -> Result<(), Refusal> {
+fn check(pose: &Pose, index: usize, field: &'static str) -> Result<(), MetricError> {
     if !pose.is_finite() {
-        return Err(Refusal::NotFinite {
+        return Err(MetricError::NotFinite {
             field,
             position: vec![index],
         });
@@ -83,7 +83,7 @@ fn check(pose: &Pose, index: usize, field: &'static str) -> Result<(), Refusal> 
     let gram = pose.rotation.transpose() * pose.rotation - Matrix3::identity();
     let error = gram.amax().max((pose.rotation.determinant() - 1.0).abs());
     if error > ROTATION_TOLERANCE {
-        return Err(Refusal::NotARotation {
+        return Err(MetricError::NotARotation {
             field,
             index,
             error,
@@ -143,7 +143,7 @@ pub fn trajectory_errors(
     reference: &[Pose],
     delta: usize,
     freedom: Freedom,
-) -> Result<TrajectoryErrors, Refusal> {
+) -> Result<TrajectoryErrors, MetricError> {
     masked_trajectory_errors(estimate, reference, None, delta, freedom)
 }
 
@@ -158,12 +158,12 @@ pub fn masked_trajectory_errors(
     valid: Option<&[bool]>,
     delta: usize,
     freedom: Freedom,
-) -> Result<TrajectoryErrors, Refusal> {
+) -> Result<TrajectoryErrors, MetricError> {
     if estimate.len() != reference.len()
         || valid.is_some_and(|v| v.len() != reference.len())
         || delta == 0
     {
-        return Err(Refusal::Shape {
+        return Err(MetricError::Shape {
             field: "trajectory",
             found: vec![estimate.len()],
             expected: vec![reference.len()],
@@ -318,6 +318,9 @@ mod tests {
         let mut estimate = walk("a");
         estimate[7].rotation[(0, 0)] += 2e-3;
         let refusal = trajectory_errors(&estimate, &walk("b"), 1, Freedom::Similarity).unwrap_err();
-        assert!(matches!(refusal, Refusal::NotARotation { index: 7, .. }));
+        assert!(matches!(
+            refusal,
+            MetricError::NotARotation { index: 7, .. }
+        ));
     }
 }

@@ -1,6 +1,6 @@
 //! Trajectories in the TUM format (`timestamp tx ty tz qx qy qz qw` per line) and their comparison as `evo` does it.
 
-use super::outcome::Refusal;
+use super::outcome::MetricError;
 use super::trajectory::{Pose, TrajectoryErrors, trajectory_errors};
 use crate::geometry::alignment::Freedom;
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
@@ -35,7 +35,7 @@ pub enum TumError {
     )]
     NoMatch { max_difference: f64 },
     #[error(transparent)]
-    Refused(#[from] Refusal),
+    Refused(#[from] MetricError),
 }
 
 /// Reads a trajectory file. Lines that are empty or start with `#` are comments.

@@ -10,7 +10,7 @@ use super::registry::Registry;
 use super::resolve::Resolver;
 use super::source::{Origin, Source, Sources};
 use super::sweep;
-use super::typed::Typer;
+use super::typed::Validator;
 use super::yaml::{self, Node};
 use std::collections::BTreeMap;
 use std::io::Read as _;
@@ -133,7 +133,7 @@ fn entry_settings(
 ) -> Option<serde_json::Value> {
     let (sources, diagnostics) = (&mut report.sources, &mut report.diagnostics);
     let node = registry.settings(kind.kind, name, asked, sources, diagnostics)?;
-    let mut typer = Typer {
+    let mut typer = Validator {
         catalog,
         registry,
         sources,

@@ -168,7 +168,7 @@ impl Resolver<'_> {
             name: draft.name,
             op: draft.op,
             files: draft.op.files(&settings),
-            data: outside::data(draft.op.data(&settings), self.data),
+            data: external_inputs::data(draft.op.data(&settings), self.data),
             settings,
             seed: draft.seed,
             edges,
@@ -179,11 +179,11 @@ impl Resolver<'_> {
         let place = |key: &str| place(key, &stage.traces, draft.span);
         for file in &stage.files {
             self.diagnostics
-                .extend(outside::missing_file(file, place(&file.key)));
+                .extend(external_inputs::missing_file(file, place(&file.key)));
         }
         for data in &stage.data {
             let root = self.data.get(&data.name);
-            self.diagnostics.extend(outside::missing_data(
+            self.diagnostics.extend(external_inputs::missing_data(
                 data,
                 root,
                 self.data_may_be_absent,

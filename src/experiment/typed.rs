@@ -37,7 +37,7 @@ impl Trace {
 }
 
 /// Turns nodes into settings.
-pub struct Typer<'c, 'm> {
+pub struct Validator<'c, 'm> {
     pub catalog: &'c Catalog,
     pub registry: &'m mut Registry,
     pub sources: &'m mut Sources,
@@ -73,7 +73,7 @@ fn last(path: &str) -> &str {
 /// Takes any value.
 static ANYTHING: Value = Value::Bool(true);
 
-impl<'c> Typer<'c, '_> {
+impl<'c> Validator<'c, '_> {
     /// The settings that a node makes; `None` after a report.
     pub fn value(&mut self, schema: &'c Value, node: &Node, path: &str) -> Option<Value> {
         self.trace(node, path);

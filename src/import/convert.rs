@@ -6,7 +6,7 @@ use super::hash::Hashes;
 use super::part::Part;
 use super::source::{Source, expand};
 use super::statistics::{self, Statistics};
-use crate::decoding::reconstructor::Binding;
+use crate::decoding::reconstructor::ModelManifest;
 use crate::mget::MgetSpec;
 use serde_json::{Map, Value, json};
 use std::collections::BTreeMap;
@@ -261,7 +261,7 @@ impl Set {
         }
         if let Some(spec) = &self.spec {
             let clips = folder::clips(spec, models.iter().map(|(_, model)| model));
-            Binding::of(work, clips)
+            ModelManifest::of(work, clips)
                 .and_then(|binding| binding.write(work))
                 .map_err(|e| ImportError::refused(work, e.to_string()))?;
         }

@@ -181,7 +181,7 @@ fn settings(
 /// Names and shapes of the parameters of a network of these sizes.
 fn inventory(settings: &VideoSettings) -> Result<BTreeMap<String, Vec<usize>>, String> {
     let compute = Compute::cpu();
-    let network = Network::new(&Initialise::planned(&compute), settings);
+    let network = Network::new(&Initialise::meta(&compute), settings);
     let all = network.map_err(|e| e.to_string())?.inventory();
     Ok(all
         .into_iter()

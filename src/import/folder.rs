@@ -127,7 +127,7 @@ pub(super) fn signals(part: &Part, statistics: Option<Statistics>) -> Result<Mod
         _ => return Err(refuse("its position tables are missing".to_owned())),
     };
     let compute = Compute::cpu();
-    let planned = VqVae::new(&Initialise::planned(&compute), &settings, &shape)
+    let planned = VqVae::new(&Initialise::meta(&compute), &settings, &shape)
         .map_err(|e| refuse(e.to_string()))?;
     part.complete(&shapes(&planned))?;
     let modality = source.plan.part.as_str();
@@ -171,8 +171,8 @@ pub(super) fn video(
     let settings: VideoSettings = serde_json::from_value(source.plan.settings.clone())
         .map_err(|e| refuse(format!("incomplete model: {e}")))?;
     let compute = Compute::cpu();
-    let planned = Network::new(&Initialise::planned(&compute), &settings)
-        .map_err(|e| refuse(e.to_string()))?;
+    let planned =
+        Network::new(&Initialise::meta(&compute), &settings).map_err(|e| refuse(e.to_string()))?;
     for side in ["encoder", "decoder"] {
         if !part.tensors.keys().any(|name| name.starts_with(side)) {
             return Err(refuse(format!("give the {side} of this tokenizer too")));

@@ -62,13 +62,13 @@ impl Side<'_> {
         }
         let mut budgets = allocate(&shares, self.total, || largest_share(self.alphas, rng));
         let excess = clamp(&mut budgets, self.room);
-        if self.overflow == Overflow::Respill {
-            self.respill(&mut budgets, excess, rng);
+        if self.overflow == Overflow::Redistribute {
+            self.redistribute(&mut budgets, excess, rng);
         }
         budgets
     }
 
-    fn respill(&self, budgets: &mut [usize], mut excess: usize, rng: &mut StreamRng) {
+    fn redistribute(&self, budgets: &mut [usize], mut excess: usize, rng: &mut StreamRng) {
         while excess > 0 {
             let left: Vec<usize> = self
                 .room
@@ -134,10 +134,10 @@ mod tests {
                 budgets.iter().sum::<usize>()
             };
             assert!(sum(Overflow::Drop) <= 2048);
-            assert_eq!(sum(Overflow::Respill), 2048);
+            assert_eq!(sum(Overflow::Redistribute), 2048);
         }
         let mut rng = stream(0, "test.overflow", 1, 0);
-        let all = side(&[1.0, 1.0], 900, &[30, 210], Overflow::Respill).draw(None, &mut rng);
+        let all = side(&[1.0, 1.0], 900, &[30, 210], Overflow::Redistribute).draw(None, &mut rng);
         assert_eq!(all, [30, 210], "stops when nothing has room");
     }
 
@@ -147,7 +147,7 @@ mod tests {
             let mut rng = stream(0, "test.never", 0, sample);
             let room = [5120, 210, 30];
             let budgets =
-                side(&[0.0, 1.0, 0.0], 777, &room, Overflow::Respill).draw(None, &mut rng);
+                side(&[0.0, 1.0, 0.0], 777, &room, Overflow::Redistribute).draw(None, &mut rng);
             assert_eq!(budgets, [0, 210, 0]);
         }
     }

@@ -149,7 +149,7 @@ impl Masking {
     fn positions(&self, budgets: &Budgets, rng: &mut StreamRng) -> Mask {
         let mut mask = Mask::default();
         for (index, slot) in self.slots.iter().enumerate() {
-            let (given, asked) = (budgets.input[index], budgets.target[index]);
+            let (inputs, asked) = (budgets.input[index], budgets.target[index]);
             let mut chosen = choose(slot.tokens, given + asked, rng);
             let mut target = chosen.split_off(given);
             chosen.sort_unstable();
@@ -304,7 +304,7 @@ mod tests {
                 ..base.clone()
             },
             MaskingSettings {
-                overflow: Overflow::Respill,
+                overflow: Overflow::Redistribute,
                 ..base.clone()
             },
             MaskingSettings {
@@ -321,13 +321,13 @@ mod tests {
                 assert!(mask.input_tokens() <= 2048 && mask.target_tokens() <= 2048);
                 assert!(mask.input_tokens() > 0, "{settings:?}");
                 for (index, slot) in slots().iter().enumerate() {
-                    let given: BTreeSet<_> = mask.input[index].iter().collect();
+                    let inputs: BTreeSet<_> = mask.input[index].iter().collect();
                     let asked: BTreeSet<_> = mask.target[index].iter().collect();
                     assert_eq!(
-                        given.len() + asked.len(),
+                        inputs.len() + asked.len(),
                         mask.input[index].len() + mask.target[index].len()
                     );
-                    assert!(given.is_disjoint(&asked));
+                    assert!(inputs.is_disjoint(&asked));
                     assert!(
                         given
                             .iter()
@@ -383,8 +383,8 @@ mod tests {
     fn task_specific_gives_video_and_asks_for_body() {
         let settings = MaskingSettings {
             alpha: Alphas::One(1.0),
-            given: vec!["rgb".into(), PIXELS.into()],
-            wanted: vec!["body".into()],
+            inputs: vec!["rgb".into(), PIXELS.into()],
+            targets: vec!["body".into()],
             ..Default::default()
         };
         for mask in masks(&settings, &[true; 5], 50) {

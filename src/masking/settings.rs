@@ -20,9 +20,9 @@ pub struct MaskingSettings {
     /// Concentrations of single modalities on the target side; 0 means never.
     pub target_alpha: BTreeMap<String, Alphas>,
     /// The only modalities that are given; empty means all. `pixels` is raw video.
-    pub given: Vec<String>,
+    pub inputs: Vec<String>,
     /// The only modalities that are asked for; empty means all. Raw video is never asked for.
-    pub wanted: Vec<String>,
+    pub targets: Vec<String>,
     /// Visible tokens of a sample: a number, or `{min, max}`.
     pub input_tokens: TokenBudget,
     /// Target tokens of a sample: a number, or `{min, max}`.
@@ -44,8 +44,8 @@ impl Default for MaskingSettings {
             weights: Vec::new(),
             input_alpha: BTreeMap::new(),
             target_alpha: BTreeMap::new(),
-            given: Vec::new(),
-            wanted: Vec::new(),
+            inputs: Vec::new(),
+            targets: Vec::new(),
             input_tokens: TokenBudget::Fixed(2048),
             target_tokens: TokenBudget::Fixed(2048),
             overflow: Overflow::Drop,
@@ -72,7 +72,7 @@ pub enum Overflow {
     /// It is lost, as in the reference: about half of the nominal tokens.
     Drop,
     /// It is drawn again among the modalities that have room.
-    Respill,
+    Redistribute,
 }
 
 /// One concentration, or one per mixture component.
@@ -203,8 +203,8 @@ impl MaskingSettings {
         }
         let base = finite("alpha", self.alpha.values())?;
         let cumulative = self.cumulative(components)?;
-        known("given", &self.given, slots)?;
-        known("wanted", &self.wanted, slots)?;
+        known("inputs", &self.inputs, slots)?;
+        known("targets", &self.targets, slots)?;
         known_keys("input_alpha", &self.input_alpha, slots)?;
         known_keys("target_alpha", &self.target_alpha, slots)?;
 
@@ -239,13 +239,13 @@ impl MaskingSettings {
             }
             Ok(table)
         };
-        let input = side("input_alpha", &self.input_alpha, &self.given, |slot| {
+        let input = side("input_alpha", &self.input_alpha, &self.inputs, |slot| {
             slot.input
         })?;
-        let target = side("target_alpha", &self.target_alpha, &self.wanted, |slot| {
+        let target = side("target_alpha", &self.target_alpha, &self.targets, |slot| {
             slot.target
         })?;
-        for (table, side) in [(&input, "given"), (&target, "asked for")] {
+        for (table, side) in [(&input, "inputs"), (&target, "asked for")] {
             if table.iter().flatten().all(|alpha| *alpha == 0.0) {
                 return Err(MaskingError::NothingLeft { side });
             }
@@ -367,9 +367,9 @@ mod tests {
         assert!(refused(|s| s.weights = vec![0.0; 4]).contains("all zero"));
         assert!(refused(|s| s.alpha = Alphas::One(f64::NAN)).contains("NaN"));
         assert!(refused(|s| s.alpha = Alphas::Mixture(vec![])).contains("no component"));
-        assert!(refused(|s| s.wanted = vec!["bodi".into()]).contains("body, camera"));
+        assert!(refused(|s| s.targets = vec!["bodi".into()]).contains("body, camera"));
         assert!(
-            refused(|s| s.wanted = vec![PIXELS.into()]).contains("no modality can be asked for")
+            refused(|s| s.targets = vec![PIXELS.into()]).contains("no modality can be asked for")
         );
         assert!(refused(|s| s.alpha = Alphas::One(0.0)).contains("no modality can be given"));
     }

@@ -82,7 +82,7 @@ pub enum Values {
 
 /// The encoder's input.
 #[derive(Debug, Clone, PartialEq, Default)]
-pub struct Visible {
+pub struct EncoderInput {
     /// Where the tokens stand.
     pub sequence: Sequence,
     /// Per modality of the spec.
@@ -102,7 +102,7 @@ pub struct Targets {
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Batch {
     /// The encoder's input.
-    pub visible: Visible,
+    pub visible: EncoderInput,
     /// The decoder's queries and their answers.
     pub targets: Targets,
 }
@@ -142,7 +142,7 @@ impl Batch {
         masks: &[Mask],
     ) -> Result<Self, BatchError> {
         Ok(Self {
-            visible: Visible::new(
+            visible: EncoderInput::new(
                 spec,
                 samples,
                 masks.iter().map(|mask| mask.input.as_slice()),
@@ -162,7 +162,7 @@ impl Batch {
     }
 }
 
-impl Visible {
+impl EncoderInput {
     /// Packs what is given of each sample.
     ///
     /// # Errors

@@ -4,7 +4,7 @@
 //! code and the modality's learned vector. An asked token is the mask token plus its place. The output matrix of a modality is
 //! the decoder's own token table; the place is shared by encoder and decoder.
 
-use super::batch::{Sequence, Values, Visible};
+use super::batch::{EncoderInput, Sequence, Values};
 use super::positions;
 use super::spec::{MgetSpec, SpecError};
 use crate::engine::ops::{embedding, linear};
@@ -110,14 +110,14 @@ impl Embeddings {
         let rows = table.len() / width;
         Ok(Self {
             modalities,
-            positions: Parameter::new(Kind::Fixed, table, &[rows, width], init.compute().device()),
+            positions: Parameter::new(Kind::Buffer, table, &[rows, width], init.compute().device()),
             offsets,
             width,
         })
     }
 
     /// What the visible tokens say: `[N, D]`.
-    pub(super) fn content(&self, visible: &Visible) -> Tensor<2> {
+    pub(super) fn token_embedding(&self, visible: &EncoderInput) -> Tensor<2> {
         // Modality by modality first, then each row to where it stands in the batch.
         let mut parts = Vec::new();
         let mut order = vec![0_u32; visible.sequence.len()];
@@ -153,7 +153,7 @@ impl Embeddings {
     }
 
     /// Where the tokens stand, `[rows, D]`: position code plus the modality's vector.
-    pub(super) fn place(&self, sequence: &Sequence) -> Tensor<2> {
+    pub(super) fn positional_embedding(&self, sequence: &Sequence) -> Tensor<2> {
         let rows: Vec<u32> = sequence
             .positions
             .iter()

@@ -2,20 +2,20 @@
 //!
 //! Read in this order: [`size`] and [`spec`] (what a model is made of, and every parameter by name), [`positions`] (the fixed
 //! codes), [`batch`] (packed tokens), [`model`] (**the forward pass, top to bottom**), [`embedding`] (how modalities enter and
-//! leave), [`loss`], `recompute` (gradients in little memory), [`names`] (the release's names of our parameters).
+//! leave), [`loss`], `activation_checkpointing` (gradients in little memory), [`names`] (the release's names of our parameters).
 
+mod activation_checkpointing;
 pub mod batch;
 mod embedding;
 pub mod loss;
 pub mod model;
 pub mod names;
 pub mod positions;
-mod recompute;
 pub mod size;
 pub mod spec;
 pub mod stored;
 
-pub use batch::{Batch, BatchError, Content, Sequence, Targets, Values, Visible};
+pub use batch::{Batch, BatchError, Content, EncoderInput, Sequence, Targets, Values};
 pub use loss::{Loss, LossValues, Losses};
 pub use model::{Context, Mget};
 pub use positions::Positions;

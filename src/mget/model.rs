@@ -1,11 +1,11 @@
 //! The Masked Generative Egocentric Transformer (Sec. 4.3, Supp. B).
 //!
-//! An encoder reads the visible tokens of all modalities; a decoder answers for asked positions, knowing only where they are
+//! An encoder reads the visible tokens of all modalities; a decoder answers for targets positions, knowing only where they are
 //! and what the encoder saw. Samples are packed without padding.
 //!
-//! Shape suffixes: `N` visible tokens of the batch, `M` asked tokens of the batch, `D` width, `V` vocabulary.
+//! Shape suffixes: `N` visible tokens of the batch, `M` targets tokens of the batch, `D` width, `V` vocabulary.
 
-use super::batch::{Batch, Sequence, Visible};
+use super::batch::{Batch, EncoderInput, Sequence};
 use super::embedding::{Embeddings, Heads};
 use super::loss::{self, Loss, Losses};
 use super::size::Size;
@@ -43,7 +43,7 @@ parameters!(Mget {
 pub struct Context {
     /// `[N, D]`; `None` when nothing is visible in the whole batch.
     tokens_ND: Option<Tensor<2>>,
-    /// Visible tokens of each sample.
+    /// EncoderInput tokens of each sample.
     lengths: Vec<usize>,
     /// For parity checks: the encoder's input and normed output.
     trace: Option<[Tensor<2>; 2]>,
@@ -93,8 +93,8 @@ impl Mget {
     ///
     /// # Errors
     /// When the spec cannot be built.
-    pub fn to_load(spec: &MgetSpec, compute: &Compute) -> Result<Self, SpecError> {
-        Self::new(spec, &Initialise::to_load(compute))
+    pub fn empty(spec: &MgetSpec, compute: &Compute) -> Result<Self, SpecError> {
+        Self::new(spec, &Initialise::empty(compute))
     }
 
     /// What the model is made of.
@@ -124,7 +124,7 @@ impl Mget {
 
     /// Reads the visible tokens.
     #[must_use]
-    pub fn encode(&self, visible: &Visible) -> Context {
+    pub fn encode(&self, visible: &EncoderInput) -> Context {
         let lengths = visible.sequence.lengths.clone();
         if visible.sequence.is_empty() {
             return Context {
@@ -134,54 +134,65 @@ impl Mget {
             };
         }
         let samples = Segments::within(&lengths);
-        let place_ND = self.encoder_embeddings.place(&visible.sequence);
-        let input_ND = self.seen(visible, place_ND.clone());
+        let positional_ND = self
+            .encoder_embeddings
+            .positional_embedding(&visible.sequence);
+        let input_ND = self.input_embedding(visible, positional_ND.clone());
         let mut h_ND = input_ND.clone();
         for block in &self.encoder {
             h_ND = block.forward(h_ND, &samples);
         }
         let h_ND = self.encoder_norm.forward(h_ND);
         Context {
-            tokens_ND: Some(self.context(h_ND.clone(), place_ND)),
+            tokens_ND: Some(self.context(h_ND.clone(), positional_ND)),
             lengths,
             trace: Some([input_ND, h_ND]),
         }
     }
 
-    /// What the encoder starts from, `[N, D]`: what a token says and where it stands. The place is used again in the context.
-    pub(super) fn seen(&self, visible: &Visible, place_ND: Tensor<2>) -> Tensor<2> {
-        self.encoder_embeddings.content(visible) + place_ND
+    /// What the encoder starts from, `[N, D]`: what a token says and where it stands. The init is used again in the context.
+    pub(super) fn input_embedding(
+        &self,
+        visible: &EncoderInput,
+        positional_ND: Tensor<2>,
+    ) -> Tensor<2> {
+        self.encoder_embeddings.token_embedding(visible) + positional_ND
     }
 
     /// What the decoder sees of the encoder's normalised output, `[N, D]`.
-    pub(super) fn context(&self, h_ND: Tensor<2>, place_ND: Tensor<2>) -> Tensor<2> {
-        self.decoder_proj_context.forward(h_ND) + place_ND
+    pub(super) fn context(&self, h_ND: Tensor<2>, positional_ND: Tensor<2>) -> Tensor<2> {
+        self.decoder_proj_context.forward(h_ND) + positional_ND
     }
 
-    /// Answers for the asked positions: `[M, D]`; `None` when nothing is asked.
+    /// Answers for the targets positions: `[M, D]`; `None` when nothing is targets.
     #[must_use]
-    pub fn decode(&self, context: &Context, asked: &Sequence) -> Option<Tensor<2>> {
-        if asked.is_empty() {
+    pub fn decode(&self, context: &Context, targets: &Sequence) -> Option<Tensor<2>> {
+        if targets.is_empty() {
             return None;
         }
-        let (own_modality, visible) = decoder_segments(&context.lengths, asked);
-        let mut y_MD = self.questions(asked);
+        let (own_modality, visible) = decoder_segments(&context.lengths, targets);
+        let mut y_MD = self.decoder_queries(targets);
         for block in &self.decoder {
             y_MD = block.forward(y_MD, context.tokens_ND.as_ref(), &own_modality, &visible);
         }
         Some(self.decoder_norm.forward(y_MD))
     }
 
-    /// What the decoder starts from, `[M, D]`: where it is asked, and nothing else.
-    pub(super) fn questions(&self, asked: &Sequence) -> Tensor<2> {
+    /// What the decoder starts from, `[M, D]`: where it is targets, and nothing else.
+    pub(super) fn decoder_queries(&self, targets: &Sequence) -> Tensor<2> {
         let mask_token_1D: Tensor<2> = self.mask_token.reshaped([1, self.spec.size.width]);
-        self.encoder_embeddings.place(asked) + mask_token_1D
+        self.encoder_embeddings.positional_embedding(targets) + mask_token_1D
     }
 
-    /// The logits of the asked tokens of `modality`, in order: `[its rows, V]`; `None` when it has none.
+    /// The logits of the targets tokens of `modality`, in order: `[its rows, V]`; `None` when it has none.
     #[must_use]
-    pub fn logits(&self, y_MD: &Tensor<2>, asked: &Sequence, modality: usize) -> Option<Tensor<2>> {
-        self.decoder_embeddings.logits(y_MD, asked, modality)
+    pub fn logits(
+        &self,
+        y_MD: &Tensor<2>,
+        targets: &Sequence,
+        modality: usize,
+    ) -> Option<Tensor<2>> {
+        self.decoder_embeddings.logits(y_MD, targets, modality)
     }
 }
 
@@ -201,12 +212,12 @@ parameters!(EncoderBlock {
 });
 
 impl EncoderBlock {
-    fn new(size: Size, place: &Initialise<'_>) -> Self {
+    fn new(size: Size, init: &Initialise<'_>) -> Self {
         Self {
-            norm1: norm(size, place, "norm1"),
-            attn: SelfAttention::new(&place.at("attn"), size.width, size.heads, false),
-            norm2: norm(size, place, "norm2"),
-            mlp: SwiGlu::new(&place.at("mlp"), size.width, size.hidden()),
+            norm1: norm(size, init, "norm1"),
+            attn: SelfAttention::new(&init.at("attn"), size.width, size.heads, false),
+            norm2: norm(size, init, "norm2"),
+            mlp: SwiGlu::new(&init.at("mlp"), size.width, size.hidden()),
         }
     }
 
@@ -239,16 +250,16 @@ parameters!(DecoderBlock {
 });
 
 impl DecoderBlock {
-    fn new(size: Size, place: &Initialise<'_>) -> Self {
+    fn new(size: Size, init: &Initialise<'_>) -> Self {
         let Size { width, heads, .. } = size;
         Self {
-            norm1: norm(size, place, "norm1"),
-            self_attn: SelfAttention::new(&place.at("self_attn"), width, heads, false),
-            query_norm: norm(size, place, "query_norm"),
-            context_norm: norm(size, place, "context_norm"),
-            cross_attn: CrossAttention::new(&place.at("cross_attn"), width, heads, false),
-            norm2: norm(size, place, "norm2"),
-            mlp: SwiGlu::new(&place.at("mlp"), width, size.hidden()),
+            norm1: norm(size, init, "norm1"),
+            self_attn: SelfAttention::new(&init.at("self_attn"), width, heads, false),
+            query_norm: norm(size, init, "query_norm"),
+            context_norm: norm(size, init, "context_norm"),
+            cross_attn: CrossAttention::new(&init.at("cross_attn"), width, heads, false),
+            norm2: norm(size, init, "norm2"),
+            mlp: SwiGlu::new(&init.at("mlp"), width, size.hidden()),
         }
     }
 
@@ -272,16 +283,16 @@ impl DecoderBlock {
     }
 }
 
-/// Who attends to whom: an asked token to those of its own modality in its own sample, and to all `visible` (rows per sample) of
+/// Who attends to whom: an targets token to those of its own modality in its own sample, and to all `visible` (rows per sample) of
 /// the sample.
-pub(super) fn decoder_segments(visible: &[usize], asked: &Sequence) -> (Segments, Segments) {
+pub(super) fn decoder_segments(visible: &[usize], targets: &Sequence) -> (Segments, Segments) {
     (
-        Segments::within(&asked.runs),
-        Segments::across(&asked.lengths, visible),
+        Segments::within(&targets.runs),
+        Segments::across(&targets.lengths, visible),
     )
 }
 
 /// A layer norm without bias.
-fn norm(size: Size, place: &Initialise<'_>, name: &str) -> LayerNorm {
-    LayerNorm::new(&place.at(name), size.width, false)
+fn norm(size: Size, init: &Initialise<'_>, name: &str) -> LayerNorm {
+    LayerNorm::new(&init.at(name), size.width, false)
 }

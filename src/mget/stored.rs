@@ -83,7 +83,7 @@ impl Mget {
         for (name, shape) in spec.parameters() {
             weights.get(&name, &shape)?;
         }
-        let mut model = Self::to_load(&spec, compute).map_err(|error| StoredError::Spec {
+        let mut model = Self::empty(&spec, compute).map_err(|error| StoredError::Spec {
             path: path.clone(),
             error,
         })?;

@@ -17,10 +17,10 @@ parameters!(SelfAttention { qkv, proj });
 
 impl SelfAttention {
     #[must_use]
-    pub fn new(place: &Initialise<'_>, width: usize, heads: usize, bias: bool) -> Self {
+    pub fn new(init: &Initialise<'_>, width: usize, heads: usize, bias: bool) -> Self {
         Self {
-            qkv: Linear::packed(&place.at("qkv"), width, 3 * width, 3, bias),
-            proj: Linear::new(&place.at("proj"), width, width, bias),
+            qkv: Linear::packed(&init.at("qkv"), width, 3 * width, 3, bias),
+            proj: Linear::new(&init.at("proj"), width, width, bias),
             heads,
         }
     }
@@ -46,11 +46,11 @@ parameters!(CrossAttention { q, kv, proj });
 
 impl CrossAttention {
     #[must_use]
-    pub fn new(place: &Initialise<'_>, width: usize, heads: usize, bias: bool) -> Self {
+    pub fn new(init: &Initialise<'_>, width: usize, heads: usize, bias: bool) -> Self {
         Self {
-            q: Linear::new(&place.at("q"), width, width, bias),
-            kv: Linear::packed(&place.at("kv"), width, 2 * width, 2, bias),
-            proj: Linear::new(&place.at("proj"), width, width, bias),
+            q: Linear::new(&init.at("q"), width, width, bias),
+            kv: Linear::packed(&init.at("kv"), width, 2 * width, 2, bias),
+            proj: Linear::new(&init.at("proj"), width, width, bias),
             heads,
         }
     }

@@ -23,12 +23,12 @@ parameters!(Block {
 impl Block {
     /// `hidden` is the width inside the MLP.
     #[must_use]
-    pub fn new(place: &Initialise<'_>, width: usize, heads: usize, hidden: usize) -> Self {
+    pub fn new(init: &Initialise<'_>, width: usize, heads: usize, hidden: usize) -> Self {
         Self {
-            norm1: LayerNorm::new(&place.at("norm1"), width, true),
-            norm2: LayerNorm::new(&place.at("norm2"), width, true),
-            attn: SelfAttention::new(&place.at("attn"), width, heads, true),
-            mlp: Mlp::new(&place.at("mlp"), width, hidden, true),
+            norm1: LayerNorm::new(&init.at("norm1"), width, true),
+            norm2: LayerNorm::new(&init.at("norm2"), width, true),
+            attn: SelfAttention::new(&init.at("attn"), width, heads, true),
+            mlp: Mlp::new(&init.at("mlp"), width, hidden, true),
         }
     }
 

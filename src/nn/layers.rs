@@ -20,22 +20,22 @@ parameters!(Linear { weight, bias });
 impl Linear {
     /// Xavier-uniform weight; the bias, if any, is 0.
     #[must_use]
-    pub fn new(place: &Initialise<'_>, inputs: usize, outputs: usize, bias: bool) -> Self {
-        Self::packed(place, inputs, outputs, 1, bias)
+    pub fn new(init: &Initialise<'_>, inputs: usize, outputs: usize, bias: bool) -> Self {
+        Self::packed(init, inputs, outputs, 1, bias)
     }
 
     /// `parts` linear layers of `outputs / parts` outputs each, stored as one (qkv, kv): initialised as if separate.
     #[must_use]
     pub fn packed(
-        place: &Initialise<'_>,
+        init: &Initialise<'_>,
         inputs: usize,
         outputs: usize,
         parts: usize,
         bias: bool,
     ) -> Self {
         Self {
-            weight: place.xavier("weight", &[outputs, inputs], inputs, outputs / parts),
-            bias: bias.then(|| place.constant(&[outputs], 0.0)),
+            weight: init.xavier("weight", &[outputs, inputs], inputs, outputs / parts),
+            bias: bias.then(|| init.constant(&[outputs], 0.0)),
         }
     }
 
@@ -61,10 +61,10 @@ parameters!(LayerNorm { weight, bias });
 impl LayerNorm {
     /// Weight 1, bias 0.
     #[must_use]
-    pub fn new(place: &Initialise<'_>, width: usize, bias: bool) -> Self {
+    pub fn new(init: &Initialise<'_>, width: usize, bias: bool) -> Self {
         Self {
-            weight: place.constant(&[width], 1.0),
-            bias: bias.then(|| place.constant(&[width], 0.0)),
+            weight: init.constant(&[width], 1.0),
+            bias: bias.then(|| init.constant(&[width], 0.0)),
         }
     }
 
@@ -90,10 +90,10 @@ parameters!(Mlp { fc1, fc2 });
 
 impl Mlp {
     #[must_use]
-    pub fn new(place: &Initialise<'_>, width: usize, hidden: usize, bias: bool) -> Self {
+    pub fn new(init: &Initialise<'_>, width: usize, hidden: usize, bias: bool) -> Self {
         Self {
-            fc1: Linear::new(&place.at("fc1"), width, hidden, bias),
-            fc2: Linear::new(&place.at("fc2"), hidden, width, bias),
+            fc1: Linear::new(&init.at("fc1"), width, hidden, bias),
+            fc2: Linear::new(&init.at("fc2"), hidden, width, bias),
         }
     }
 
@@ -121,11 +121,11 @@ parameters!(SwiGlu { fc1, fc3, fc2 });
 
 impl SwiGlu {
     #[must_use]
-    pub fn new(place: &Initialise<'_>, width: usize, hidden: usize) -> Self {
+    pub fn new(init: &Initialise<'_>, width: usize, hidden: usize) -> Self {
         Self {
-            fc1: Linear::new(&place.at("fc1"), width, hidden, false),
-            fc3: Linear::new(&place.at("fc3"), width, hidden, false),
-            fc2: Linear::new(&place.at("fc2"), hidden, width, false),
+            fc1: Linear::new(&init.at("fc1"), width, hidden, false),
+            fc3: Linear::new(&init.at("fc3"), width, hidden, false),
+            fc2: Linear::new(&init.at("fc2"), hidden, width, false),
         }
     }
 

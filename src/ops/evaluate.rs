@@ -5,7 +5,7 @@
 
 use super::modality_entry::{DEFAULTS, read_defaults};
 use crate::clip::store::ClipSet;
-use crate::evaluation::compare::{CompareSettings, Entrant, compare};
+use crate::evaluation::compare::{CompareSettings, Method, compare};
 use crate::evaluation::evaluate::Pairs;
 use crate::evaluation::evaluate::{Embeddings, EvaluationError, evaluate};
 use crate::evaluation::folders::{Folders, Stored};
@@ -225,7 +225,7 @@ impl Op for Evaluate {
         };
         scores.write(context.output()).map_err(StageError::other)?;
         let clips = scores.clips.len();
-        let entrant = Entrant {
+        let entrant = Method {
             label: system.clone(),
             seeds: vec![scores],
         };
@@ -326,13 +326,13 @@ pub(super) fn write_text(root: &Path, name: &str, text: &str) -> Result<(), Stag
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::evaluation::outcome::Refusal;
+    use crate::evaluation::outcome::MetricError;
 
     #[test]
     fn the_help_fits_the_reason() {
         let refused = EvaluationError::Refused {
             clip: "a".to_owned(),
-            refusal: Refusal::ZeroEmbedding { row: 0 },
+            refusal: MetricError::ZeroEmbedding { row: 0 },
         };
         let damaged = EvaluationError::Load {
             clip: "a".to_owned(),

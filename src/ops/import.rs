@@ -4,7 +4,7 @@
 //! The artifact is a copy, so that what it was made from can be seen and used whatever becomes of the folder. Its identity is
 //! that of the folder's bytes, wherever it lies.
 
-use crate::decoding::reconstructor::{Binding, FILE};
+use crate::decoding::reconstructor::{FILE, ModelManifest};
 use crate::experiment::{
     ArtifactKind, Code, Description, FileInput, FilePath, Inputs, Op, OpEntry, Port, Problem,
     StageContext, StageError, StagePlan, TokenFacts,
@@ -155,7 +155,7 @@ fn described(folder: &Path) -> Result<MgetSpec, String> {
             return Err(format!("it has no `{file}`"));
         }
     }
-    Binding::read(folder).map_err(|error| error.to_string())?;
+    ModelManifest::read(folder).map_err(|error| error.to_string())?;
     let spec = read_spec(folder).map_err(|error| error.to_string())?;
     spec.check().map_err(|error| error.to_string())?;
     Ok(spec)

@@ -1,11 +1,11 @@
-//! `op: predict`: a model generates what it was not given, for every clip of a split (Supp. C).
+//! `op: predict`: a model generates what it was not inputs, for every clip of a split (Supp. C).
 //!
 //! Writes a folder of [`crate::reconstruction::predictions`]: decoded signals with a confidence per sample, and beside it the
 //! tokenizer floor: the clips' own signals after a round trip through the model's tokenizers.
 
 use crate::clip::Clip;
 use crate::clip::store::ClipSet;
-use crate::decoding::{DecodingSettings, Reconstructor, ReconstructorError, Wish};
+use crate::decoding::{DecodingSettings, GenerationRequest, Reconstructor, ReconstructorError};
 use crate::engine::Compute;
 use crate::evaluation::runtime::runtime;
 use crate::experiment::{
@@ -30,11 +30,11 @@ const BATCH: usize = 8;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct PredictSettings {
-    /// Modalities the model is given: `rgb` is the video's tokens, and raw video where the model takes it; `pixels` is raw video
+    /// Modalities the model is inputs: `rgb` is the video's tokens, and raw video where the model takes it; `pixels` is raw video
     /// alone.
-    pub given: Vec<String>,
+    pub inputs: Vec<String>,
     /// Modalities it generates; empty means all others.
-    pub wanted: Vec<String>,
+    pub targets: Vec<String>,
     /// How tokens are generated.
     pub decoding: Entry<DecodingSettings>,
     /// Which clips.
@@ -49,8 +49,8 @@ pub struct PredictSettings {
 impl Default for PredictSettings {
     fn default() -> Self {
         Self {
-            given: vec!["rgb".to_owned()],
-            wanted: Vec::new(),
+            inputs: vec!["rgb".to_owned()],
+            targets: Vec::new(),
             decoding: Entry {
                 name: "fast".to_owned(),
                 settings: DecodingSettings::default(),
@@ -83,8 +83,8 @@ impl PredictSettings {
     /// The modalities to generate, of those the model knows.
     fn targets<'a>(&self, known: impl Iterator<Item = &'a str>) -> Vec<String> {
         known
-            .filter(|name| *name != PIXELS && !self.given.iter().any(|given| given == name))
-            .filter(|name| self.wanted.is_empty() || self.wanted.iter().any(|w| w == name))
+            .filter(|name| *name != PIXELS && !self.inputs.iter().any(|given| inputs == name))
+            .filter(|name| self.targets.is_empty() || self.targets.iter().any(|w| w == name))
             .map(ToOwned::to_owned)
             .collect()
     }
@@ -102,7 +102,7 @@ impl Op for Predict {
     }
 
     fn about(&self) -> &'static str {
-        "Generates the modalities a model was not given, for the clips of a split."
+        "Generates the modalities a model was not inputs, for the clips of a split."
     }
 
     fn inputs(&self) -> &'static [Port] {
@@ -136,9 +136,9 @@ impl Op for Predict {
             return Description::default();
         };
         let known: Vec<&str> = model.tokens.keys().map(String::as_str).collect();
-        for (key, names) in [("given", &settings.given), ("wanted", &settings.wanted)] {
+        for (key, names) in [("inputs", &settings.inputs), ("targets", &settings.targets)] {
             for (index, name) in names.iter().enumerate() {
-                let video = key == "given" && name == PIXELS && takes_pixels(model);
+                let video = key == "inputs" && name == PIXELS && takes_pixels(model);
                 if !video && !known.contains(&name.as_str()) {
                     problems.push(
                         Problem::new(
@@ -151,12 +151,12 @@ impl Op for Predict {
                 }
             }
         }
-        for (index, name) in settings.given.iter().enumerate() {
+        for (index, name) in settings.inputs.iter().enumerate() {
             let signal = signal_of(name);
             if !clips.signals.is_empty() && !clips.signals.contains_key(signal) {
                 problems.push(Problem::new(
                     Code::E0203,
-                    format!("given.{index}"),
+                    format!("inputs.{index}"),
                     format!("the clips have no `{signal}`"),
                 ));
             }
@@ -172,7 +172,7 @@ impl Op for Predict {
         if targets.is_empty() {
             problems.push(Problem::new(
                 Code::E0206,
-                "wanted",
+                "targets",
                 "nothing is left to generate",
             ));
         }
@@ -225,9 +225,9 @@ impl Op for Predict {
         let clips = ClipSet::open(&root).map_err(StageError::other)?;
         let total = clips.len().min(settings.limit.unwrap_or(usize::MAX));
         let targets = settings.targets(reconstructor.names());
-        let wish = Wish {
-            given: &settings.given,
-            wanted: &targets,
+        let request = GenerationRequest {
+            inputs: &settings.inputs,
+            targets: &targets,
             decoding: &settings.decoding.settings,
             seed: context.seed(),
         };
@@ -240,7 +240,7 @@ impl Op for Predict {
         if settings.floor {
             floor = Some(create(&context.output().join(FLOOR), "tokenizer floor")?);
         }
-        let mut read: Vec<&str> = settings.given.iter().map(|name| signal_of(name)).collect();
+        let mut read: Vec<&str> = settings.inputs.iter().map(|name| signal_of(name)).collect();
         if settings.floor {
             read.extend(targets.iter().map(String::as_str));
         }
@@ -259,17 +259,19 @@ impl Op for Predict {
                 })
                 .map_err(StageError::other)?;
             let ids: Vec<u64> = (done..done + count).map(|i| i as u64).collect();
-            let seen = times
-                .take("encode", count, || reconstructor.see(&batch, wish.given))
+            let conditioning = times
+                .take("encode", count, || {
+                    reconstructor.encode_inputs(&batch, request.inputs)
+                })
                 .map_err(refused)?;
             let tokens = times
                 .take("generate", count, || {
-                    reconstructor.generate(&seen, &ids, &wish)
+                    reconstructor.generate(&conditioning, &ids, &request)
                 })
                 .map_err(refused)?;
             let made = times
                 .take("detokenize", count, || {
-                    reconstructor.decode(&batch, &tokens, &wish)
+                    reconstructor.decode(&batch, &tokens, &request)
                 })
                 .map_err(refused)?;
             for one in made {
@@ -298,7 +300,7 @@ impl Op for Predict {
         Ok(json!({
             "split": settings.split,
             "clips": total,
-            "given": settings.given,
+            "inputs": settings.inputs,
             "generated": targets,
             "decoding": settings.decoding.name,
         }))
@@ -382,7 +384,9 @@ pub(super) fn refused(error: ReconstructorError) -> StageError {
         ReconstructorError::OtherTokenizer { .. } | ReconstructorError::OtherGrid { .. } => {
             "import or train the model together with its tokenizers"
         }
-        ReconstructorError::NotGiven { .. } => "leave it out of `given`, or use clips that have it",
+        ReconstructorError::MissingInput { .. } => {
+            "leave it out of `inputs`, or use clips that have it"
+        }
         ReconstructorError::UnknownModality { .. }
         | ReconstructorError::Clip { .. }
         | ReconstructorError::Tokenizer(_) => "use clips of the form the model was trained on",

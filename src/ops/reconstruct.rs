@@ -42,11 +42,11 @@ pub struct ReconstructSettings {
     pub clip: usize,
     /// A model folder that no stage makes.
     pub model_folder: Option<FilePath>,
-    /// What of the video the model is given: `rgb` is its tokens, and raw video where the model takes it; `pixels` is raw video
+    /// What of the video the model is inputs: `rgb` is its tokens, and raw video where the model takes it; `pixels` is raw video
     /// alone. Empty means `rgb`, or `pixels` for a model without tokens of video.
-    pub given: Vec<String>,
+    pub inputs: Vec<String>,
     /// What is generated; empty means everything but `rgb`.
-    pub wanted: Vec<String>,
+    pub targets: Vec<String>,
     /// How tokens are generated.
     pub decoding: Entry<DecodingSettings>,
     /// Seconds that neighbouring windows of two seconds have in common: 0.5, 1 or 1.5.
@@ -70,8 +70,8 @@ impl Default for ReconstructSettings {
             split: "test".to_owned(),
             clip: 0,
             model_folder: None,
-            given: Vec::new(),
-            wanted: Vec::new(),
+            inputs: Vec::new(),
+            targets: Vec::new(),
             decoding: Entry {
                 name: "fast".to_owned(),
                 settings: DecodingSettings::default(),
@@ -182,12 +182,12 @@ impl Op for Reconstruct {
         }
         if let Some(model) = model {
             let known: Vec<&str> = model.tokens.keys().map(String::as_str).collect();
-            for (index, name) in settings.wanted.iter().enumerate() {
+            for (index, name) in settings.targets.iter().enumerate() {
                 if !known.contains(&name.as_str()) {
                     problems.push(
                         Problem::new(
                             Code::E0203,
-                            format!("wanted.{index}"),
+                            format!("targets.{index}"),
                             format!("the model has no modality `{name}`"),
                         )
                         .help(format!("it has: {}", known.join(", "))),
@@ -195,7 +195,7 @@ impl Op for Reconstruct {
                 }
             }
         }
-        for (index, name) in settings.given.iter().enumerate() {
+        for (index, name) in settings.inputs.iter().enumerate() {
             let wrong = if name != "rgb" && name != PIXELS {
                 Some((
                     format!("a video has no `{name}`"),
@@ -208,7 +208,7 @@ impl Op for Reconstruct {
             };
             if let Some((message, help)) = wrong {
                 problems
-                    .push(Problem::new(Code::E0203, format!("given.{index}"), message).help(help));
+                    .push(Problem::new(Code::E0203, format!("inputs.{index}"), message).help(help));
             }
         }
         if let Err(error) = windows(1.0, settings.overlap) {

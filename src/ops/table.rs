@@ -2,7 +2,7 @@
 //! and, for the report page, the table and its intervals as a plot.
 
 use super::evaluate::write_text;
-use crate::evaluation::compare::{CompareSettings, Entrant, compare};
+use crate::evaluation::compare::{CompareSettings, Method, compare};
 use crate::evaluation::intervals;
 use crate::evaluation::published::Published;
 use crate::evaluation::render::{Format, render};
@@ -109,10 +109,10 @@ impl Op for TableOp {
         let labels = labels(&settings.labels, &stages, &systems);
         let mut how = settings.compare.clone();
         how.baseline = how.baseline.map(|name| row(name, &labels, &stages));
-        let entrants: Vec<Entrant> = labels
+        let entrants: Vec<Method> = labels
             .into_iter()
             .zip(scores)
-            .map(|(label, scores)| Entrant {
+            .map(|(label, scores)| Method {
                 label,
                 seeds: vec![scores],
             })

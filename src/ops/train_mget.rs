@@ -13,7 +13,7 @@ use crate::experiment::{
 };
 use crate::masking::{MaskingError, MaskingSettings, PIXELS, simulate};
 use crate::mget::{MgetSpec, ModalitySpec, Positions, Size, SpecError};
-use crate::training::{Measure, TrainingSettings};
+use crate::training::{DatasetSize, TrainingSettings};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
@@ -342,9 +342,9 @@ fn training_clips(settings: &TrainMgetSettings, inputs: &Inputs<'_>) -> u64 {
         .sum()
 }
 
-fn measure(settings: &TrainMgetSettings, clips: u64) -> Measure {
+fn measure(settings: &TrainMgetSettings, clips: u64) -> DatasetSize {
     let masking = &settings.masking.settings;
-    Measure {
+    DatasetSize {
         clips,
         tokens_per_sample: (masking.input_tokens.bounds().1 + masking.target_tokens.bounds().1)
             as u64,

@@ -31,7 +31,7 @@ pub struct Tracks {
 
 /// How well two neighbouring windows agree where they overlap, before blending.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
-pub struct Seam {
+pub struct WindowBoundary {
     /// The later window.
     pub window: usize,
     /// Seconds from the start of the video.
@@ -52,7 +52,7 @@ pub struct Stitcher {
     /// Pose of the first camera in the world.
     first: Rigid,
     tracks: Tracks,
-    seams: Vec<Seam>,
+    seams: Vec<WindowBoundary>,
 }
 
 impl Stitcher {
@@ -67,10 +67,10 @@ impl Stitcher {
 
     /// Adds the decoded clip of a window. Windows must come in order.
     pub fn push(&mut self, window: &Window, clip: &Clip) {
-        let mut seam = Seam {
+        let mut seam = WindowBoundary {
             window: window.index,
             at_seconds: window.start_seconds(),
-            ..Seam::default()
+            ..WindowBoundary::default()
         };
         let mut first_camera = self.first;
         if let Some(camera) = &clip.camera {
@@ -140,7 +140,7 @@ impl Stitcher {
     }
 
     /// What has been built, and how the seams were.
-    pub fn finish(self) -> (Tracks, Vec<Seam>) {
+    pub fn finish(self) -> (Tracks, Vec<WindowBoundary>) {
         (self.tracks, self.seams)
     }
 

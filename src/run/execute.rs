@@ -4,14 +4,14 @@
 //! under its key's lock, so that shards and other runs over the same disk wait for it instead of doing it twice.
 
 use super::cache::{Cache, Entry, Key};
-use super::crew::{Crew, Ended};
 use super::error::RunError;
 use super::inputs::Fingerprints;
 use super::interrupt::Interrupt;
 use super::progress::{Progress, duration};
 use super::record::{Owned, RunDirectory, Shard, State};
-use super::schedule::{Schedule, Work};
+use super::schedule::{Schedule, Task};
 use super::stage::{self, Surroundings};
+use super::worker_pool::{Ended, WorkerPool};
 use super::{provenance, report};
 use crate::experiment::Experiment;
 use std::collections::BTreeSet;
@@ -27,7 +27,7 @@ pub struct Job<'a> {
     pub only: Option<&'a str>,
     pub shard: Shard,
     /// How many stages at once.
-    pub crew: Crew,
+    pub crew: WorkerPool,
     pub progress: &'a Progress,
     pub interrupt: &'a Interrupt,
 }
@@ -158,7 +158,7 @@ impl Worker<'_> {
                 ..Ended::default()
             };
         }
-        let make = |index: usize, work: &Work| {
+        let make = |index: usize, work: &Task| {
             self.job.interrupt.check()?;
             let label = work.label(self.schedule.sweep);
             let made = self.one(work, &label, index + 1, to_do.len());
@@ -190,7 +190,7 @@ impl Worker<'_> {
         Ok(())
     }
 
-    fn one(&self, work: &Work, label: &str, index: usize, of: usize) -> Result<(), RunError> {
+    fn one(&self, work: &Task, label: &str, index: usize, of: usize) -> Result<(), RunError> {
         let progress = self.job.progress;
         let _lock = self.cache.lock(&work.key, self.job.interrupt, |holder| {
             let who =
@@ -222,7 +222,7 @@ impl Worker<'_> {
         Ok(())
     }
 
-    fn directory(&self, work: &Work) -> std::path::PathBuf {
+    fn directory(&self, work: &Task) -> std::path::PathBuf {
         self.run.path().join("stages").join(&work.directory)
     }
 }

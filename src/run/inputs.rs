@@ -60,13 +60,13 @@ impl<'a> Fingerprints<'a> {
             return Ok(*known);
         }
         let print =
-            Look::at(path, self.memory.as_deref())?.take(self.watched, environment::now())?;
+            Scan::at(path, self.memory.as_deref())?.take(self.watched, environment::now())?;
         self.taken.insert(path.to_path_buf(), print);
         Ok(print)
     }
 
     /// The fingerprint, if at most `most` bytes have to be read for it; otherwise how many have to. Writes nothing.
-    pub fn quickly(
+    pub fn within_limit(
         &mut self,
         path: &Path,
         most: u64,
@@ -74,7 +74,7 @@ impl<'a> Fingerprints<'a> {
         if let Some(known) = self.taken.get(path) {
             return Ok(Ok(*known));
         }
-        let mut look = Look::at(path, self.memory.as_deref())?;
+        let mut look = Scan::at(path, self.memory.as_deref())?;
         let unread = look.unread();
         if unread > most {
             return Ok(Err(unread));
@@ -93,7 +93,7 @@ impl<'a> Fingerprints<'a> {
 
 /// What tells that a file is still the one that was read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-struct Stamp {
+struct FileMetadata {
     bytes: u64,
     /// Nanoseconds since 1970: of the last change of the bytes, and of the file (which nobody can set back).
     modified: i64,
@@ -101,7 +101,7 @@ struct Stamp {
     inode: u64,
 }
 
-impl Stamp {
+impl FileMetadata {
     fn of(meta: &Metadata) -> Self {
         #[cfg(unix)]
         {
@@ -141,27 +141,27 @@ impl Stamp {
 struct Remembered {
     root: PathBuf,
     /// Name below the root to its stamp and the hash of its bytes.
-    files: BTreeMap<String, (Stamp, String)>,
+    files: BTreeMap<String, (FileMetadata, String)>,
 }
 
 /// One name below a folder.
 #[derive(Debug)]
 enum Found {
-    File(PathBuf, Stamp, Option<blake3::Hash>),
+    File(PathBuf, FileMetadata, Option<blake3::Hash>),
     /// A link to a folder that was met before, a broken link, a pipe: never read.
     Other(String),
 }
 
 /// A file or a folder with what is known of it.
 #[derive(Debug)]
-struct Look {
+struct Scan {
     root: PathBuf,
     folder: bool,
     found: BTreeMap<String, Found>,
     memory: Option<PathBuf>,
 }
 
-impl Look {
+impl Scan {
     fn at(root: &Path, memory: Option<&Path>) -> Result<Self, RunError> {
         let meta = std::fs::metadata(root).at("reading", root)?;
         let mut look = Self {
@@ -175,7 +175,7 @@ impl Look {
         } else {
             look.found.insert(
                 String::new(),
-                Found::File(root.to_owned(), Stamp::of(&meta), None),
+                Found::File(root.to_owned(), FileMetadata::of(&meta), None),
             );
         }
         look.recall();
@@ -204,7 +204,7 @@ impl Look {
                 let found = match std::fs::metadata(&path) {
                     Err(_) if path.is_symlink() => Found::Other("leads nowhere".into()),
                     Err(error) => return Err(error).at("reading", &path),
-                    Ok(meta) if meta.is_file() => Found::File(path, Stamp::of(&meta), None),
+                    Ok(meta) if meta.is_file() => Found::File(path, FileMetadata::of(&meta), None),
                     Ok(meta) if meta.is_dir() => {
                         let linked = real(&path)?;
                         if let Some(first) = met.get(&linked) {
@@ -290,7 +290,7 @@ impl Look {
 
     fn read(&mut self, watched: Option<(&Progress, &Interrupt)>, now: f64) -> Result<(), RunError> {
         let total = self.unread();
-        let mut open: Vec<(&PathBuf, Stamp, &mut Option<blake3::Hash>)> = self
+        let mut open: Vec<(&PathBuf, FileMetadata, &mut Option<blake3::Hash>)> = self
             .found
             .values_mut()
             .filter_map(|found| match found {
@@ -310,7 +310,7 @@ impl Look {
             some.par_iter_mut().try_for_each(|(path, stamp, hash)| {
                 let (read, bytes) = files::hash(path)?;
                 // What was listed and what was read must be one file.
-                let after = Stamp::of(&std::fs::metadata(*path).at("reading", path)?);
+                let after = FileMetadata::of(&std::fs::metadata(*path).at("reading", path)?);
                 if after != *stamp || bytes != stamp.bytes {
                     return Err(RunError::Changed {
                         what: format!("`{}`", path.display()),
@@ -372,12 +372,12 @@ mod tests {
 
     /// Takes a fingerprint a minute from now, when every file has settled.
     fn later(path: &Path, memory: &Path) -> Fingerprint {
-        let look = Look::at(path, Some(memory)).unwrap();
+        let look = Scan::at(path, Some(memory)).unwrap();
         look.take(None, environment::now() + 60.0).unwrap()
     }
 
     fn unread(path: &Path, memory: &Path) -> u64 {
-        Look::at(path, Some(memory)).unwrap().unread()
+        Scan::at(path, Some(memory)).unwrap().unread()
     }
 
     #[test]
@@ -431,7 +431,7 @@ mod tests {
     #[test]
     fn a_file_that_was_just_written_is_not_trusted_to_stay() {
         let (dir, memory) = (folder(&[("a", "1")]), folder(&[]));
-        let look = Look::at(dir.path(), Some(memory.path())).unwrap();
+        let look = Scan::at(dir.path(), Some(memory.path())).unwrap();
         look.take(None, environment::now()).unwrap();
         assert_eq!(unread(dir.path(), memory.path()), 1);
     }
@@ -454,8 +454,8 @@ mod tests {
         let cache = Cache::new(dir.path().join("cache"));
         let data = dir.path().join("data");
         let mut prints = Fingerprints::remembered(&cache);
-        assert_eq!(prints.quickly(&data, 4).unwrap(), Err(5));
-        let print = prints.quickly(&data, 5).unwrap().unwrap();
+        assert_eq!(prints.within_limit(&data, 4).unwrap(), Err(5));
+        let print = prints.within_limit(&data, 5).unwrap().unwrap();
         assert_eq!(print, fingerprint(&data).unwrap());
         assert!(!dir.path().join("cache/fingerprints").exists());
     }

@@ -12,7 +12,6 @@
 pub mod cache;
 pub mod checkpoint;
 mod context;
-pub mod crew;
 mod curves;
 pub mod environment;
 pub mod error;
@@ -32,10 +31,11 @@ pub mod schedule;
 pub mod stage;
 pub mod tensorboard;
 pub mod verify;
+pub mod worker_pool;
 
 pub use cache::{Cache, Key, Manifest};
-pub use crew::Crew;
 pub use error::RunError;
 pub use interrupt::Interrupt;
 pub use progress::Progress;
 pub use record::{RunDirectory, Shard, State};
+pub use worker_pool::WorkerPool;

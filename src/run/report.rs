@@ -15,7 +15,7 @@ use super::metrics;
 use super::progress::duration;
 use super::provenance::LockFile;
 use super::record::{Run, RunDirectory};
-use super::schedule::{Schedule, Work};
+use super::schedule::{Schedule, Task};
 use super::stage::StageRecord;
 use base64::Engine as _;
 use base64::engine::general_purpose::STANDARD;
@@ -106,7 +106,7 @@ fn head(page: &mut String, run: &Run, schedule: &Schedule, directory: &RunDirect
 }
 
 /// What an experiment is for, and the rest: the stages that no other reads. A sweep's result is its comparison.
-fn results(schedule: &Schedule) -> (Vec<&Work>, Vec<&Work>) {
+fn results(schedule: &Schedule) -> (Vec<&Task>, Vec<&Task>) {
     let ports = schedule.works.iter().flat_map(|work| &work.inputs);
     let read: BTreeSet<&Key> = ports.flat_map(|p| &p.from).map(|(_, key)| key).collect();
     schedule
@@ -135,7 +135,7 @@ fn comparison(page: &mut String, directory: &RunDirectory) {
     }
 }
 
-fn stage_directory(directory: &RunDirectory, work: &Work) -> std::path::PathBuf {
+fn stage_directory(directory: &RunDirectory, work: &Task) -> std::path::PathBuf {
     directory.path().join("stages").join(&work.directory)
 }
 
@@ -279,7 +279,7 @@ fn number(value: f64) -> String {
 /// What an op left to be shown.
 fn sections(
     page: &mut String,
-    work: &Work,
+    work: &Task,
     schedule: &Schedule,
     cache: &Cache,
 ) -> Result<(), RunError> {
@@ -322,7 +322,7 @@ fn sections(
 /// The page of a reconstruction, copied beside this one and linked.
 fn linked(
     page: &mut String,
-    work: &Work,
+    work: &Task,
     schedule: &Schedule,
     directory: &RunDirectory,
     cache: &Cache,

@@ -22,7 +22,7 @@ pub struct Schedule {
     pub sweep: bool,
     pub cells: Vec<CellPlan>,
     /// Inputs come before what reads them.
-    pub works: Vec<Work>,
+    pub works: Vec<Task>,
     /// Data sets that are read: name to directory.
     pub data: BTreeMap<String, PathBuf>,
 }
@@ -41,7 +41,7 @@ pub struct CellPlan {
 
 /// One piece of work.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Work {
+pub struct Task {
     pub key: Key,
     /// The stage's name where it appears first.
     pub stage: String,
@@ -86,7 +86,7 @@ impl Schedule {
     /// Lays out the work of a checked experiment, with the fingerprints of the outside files and data sets that it reads.
     pub fn of(experiment: &Experiment, mut prints: Fingerprints<'_>) -> Result<Self, RunError> {
         let mut cells = Vec::new();
-        let mut works: Vec<Work> = Vec::new();
+        let mut works: Vec<Task> = Vec::new();
         let mut places: BTreeMap<Key, usize> = BTreeMap::new();
         for cell in &experiment.cells {
             let label = cell.label();
@@ -147,7 +147,7 @@ impl Schedule {
         })
     }
 
-    pub fn work(&self, key: &Key) -> Option<&Work> {
+    pub fn work(&self, key: &Key) -> Option<&Task> {
         self.works.iter().find(|work| work.key == *key)
     }
 
@@ -190,7 +190,7 @@ impl Schedule {
     }
 
     /// The work that `targets` need and the cache does not have, inputs first.
-    pub fn to_do(&self, targets: &BTreeSet<Key>, cache: &Cache) -> Vec<&Work> {
+    pub fn to_do(&self, targets: &BTreeSet<Key>, cache: &Cache) -> Vec<&Task> {
         let mut missing: BTreeSet<Key> = BTreeSet::new();
         let mut needed: BTreeSet<Key> = targets.clone();
         // Inputs come first in `works`, so that walking backwards meets every reader before what it reads.
@@ -207,7 +207,7 @@ impl Schedule {
     }
 }
 
-impl Work {
+impl Task {
     pub fn input_keys(&self) -> impl Iterator<Item = Key> + '_ {
         self.inputs
             .iter()
@@ -241,7 +241,7 @@ fn work(
     keys: &[Key],
     label: &str,
     prints: &Fingerprints<'_>,
-) -> Work {
+) -> Task {
     let from = |index: &usize| (graph.stages[*index].name.clone(), keys[*index]);
     let inputs = stage.edges.iter().map(|edge| PortPlan {
         port: edge.port.to_owned(),
@@ -264,7 +264,7 @@ fn work(
             bytes: print.map_or(0, |print| print.bytes),
         }
     });
-    Work {
+    Task {
         key,
         stage: stage.name.clone(),
         directory: String::new(),
@@ -318,7 +318,7 @@ fn identity(name: &str, cells: &[CellPlan]) -> Key {
 }
 
 /// `mget` in an experiment; `full-s0/mget` or `shared/clips` in a sweep, with digits of the key where two want one name.
-fn name_directories(works: &mut [Work], sweep: bool) {
+fn name_directories(works: &mut [Task], sweep: bool) {
     let mut taken = BTreeSet::new();
     for work in works {
         let stage = work.stage.replace(['/', '\\'], ".");

@@ -10,7 +10,7 @@ use super::interrupt::Interrupt;
 use super::metrics::Metrics;
 use super::progress::Progress;
 use super::record::State;
-use super::schedule::Work;
+use super::schedule::Task;
 use crate::experiment::InputArtifact;
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
@@ -49,7 +49,7 @@ impl StageRecord {
         files::write_json(&directory.join("stage.json"), self)
     }
 
-    fn new(work: &Work, cache: &Cache) -> Self {
+    fn new(work: &Task, cache: &Cache) -> Self {
         let runs = cache.root().parent().unwrap_or(Path::new(""));
         let artifact = cache.path(&work.key);
         let artifact = artifact.strip_prefix(runs).unwrap_or(&artifact);
@@ -70,7 +70,7 @@ impl StageRecord {
 }
 
 /// Notes in a stage's directory that its artifact was there already.
-pub fn note_cached(work: &Work, directory: &Path, cache: &Cache) -> Result<(), RunError> {
+pub fn note_cached(work: &Task, directory: &Path, cache: &Cache) -> Result<(), RunError> {
     let kept = StageRecord::read(directory).filter(|record| record.key == work.key);
     if kept
         .as_ref()
@@ -102,7 +102,7 @@ pub struct Surroundings<'a> {
 
 /// Does one piece of work in `directory` and puts the artifact into the cache. The caller holds the key's lock.
 pub fn make(
-    work: &Work,
+    work: &Task,
     label: &str,
     directory: &Path,
     around: &Surroundings<'_>,
@@ -155,7 +155,7 @@ pub fn make(
 }
 
 /// What was hashed before the work must be what the work has read.
-fn unchanged(work: &Work, cache: &Cache) -> Result<(), RunError> {
+fn unchanged(work: &Task, cache: &Cache) -> Result<(), RunError> {
     let mut prints = Fingerprints::remembered(cache);
     for file in &work.files {
         if prints.of(&file.path)?.hash.to_hex().as_str() != file.blake3 {
@@ -171,7 +171,7 @@ fn unchanged(work: &Work, cache: &Cache) -> Result<(), RunError> {
 /// Does one piece of work again, in a scratch directory with `checkpoints/` to start from, and gives the directory of what
 /// it made. Nothing of the run or the cache changes.
 pub fn redo(
-    work: &Work,
+    work: &Task,
     label: &str,
     scratch: &Path,
     around: &Surroundings<'_>,
@@ -184,7 +184,7 @@ pub fn redo(
 
 /// Runs the op: its seconds, and what it says of its artifact.
 fn perform(
-    work: &Work,
+    work: &Task,
     label: &str,
     directory: &Path,
     output: PathBuf,
@@ -236,7 +236,7 @@ fn stage_path(directory: &Path, cache: &Cache) -> String {
 }
 
 /// What decided the artifact, for its manifest. Paths stay out: where a file lies decides nothing.
-pub fn recipe(work: &Work) -> Recipe {
+pub fn recipe(work: &Task) -> Recipe {
     let mut settings = work.settings.clone();
     for file in &work.files {
         let mut at = Some(&mut settings);
@@ -276,7 +276,7 @@ pub fn recipe(work: &Work) -> Recipe {
     }
 }
 
-fn inputs(work: &Work, cache: &Cache) -> Result<Vec<(String, Vec<InputArtifact>)>, RunError> {
+fn inputs(work: &Task, cache: &Cache) -> Result<Vec<(String, Vec<InputArtifact>)>, RunError> {
     let mut ports = Vec::new();
     for port in &work.inputs {
         let mut artifacts = Vec::new();

@@ -12,7 +12,7 @@ use super::interrupt::Interrupt;
 use super::progress::Progress;
 use super::provenance::LockFile;
 use super::record::RunDirectory;
-use super::schedule::{Schedule, Work};
+use super::schedule::{Schedule, Task};
 use super::stage::{self, Surroundings};
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -125,7 +125,7 @@ fn outside(lock: &LockFile) -> Vec<Check> {
 /// Does one piece of work again beside the run and compares.
 fn again(
     run: &RunDirectory,
-    work: &Work,
+    work: &Task,
     label: &str,
     redo: Redo,
     around: &Surroundings<'_>,
@@ -162,7 +162,7 @@ fn again(
     Check::of(&what, result, &how)
 }
 
-fn compare(work: &Work, cache: &Cache, output: &Path) -> Result<(), RunError> {
+fn compare(work: &Task, cache: &Cache, output: &Path) -> Result<(), RunError> {
     let changed = |detail: String| RunError::Changed {
         what: work.stage.clone(),
         detail,

@@ -92,20 +92,20 @@ pub struct Update {
 impl Quantizer {
     /// A fresh codebook: random directions, no counts.
     #[must_use]
-    pub fn new(place: &Initialise<'_>, settings: &QuantizerSettings) -> Self {
-        let place = place.at("_codebook");
+    pub fn new(init: &Initialise<'_>, settings: &QuantizerSettings) -> Self {
+        let init = init.at("_codebook");
         let (codes, width) = (settings.codebook, settings.code_width);
         let directions = || {
             let bound = (6.0 / width as f64).sqrt();
-            let mut drawn = place.uniform("embed", &[codes, width], bound).to_vec();
+            let mut drawn = init.uniform("embed", &[codes, width], bound).to_vec();
             normalise(&mut drawn, width);
             drawn
         };
         Self {
             state: State {
-                initted: place.fixed(&[1], || vec![1.0]),
-                cluster_size: place.fixed(&[codes], || vec![0.0; codes]),
-                embed: place.fixed(&[codes, width], directions),
+                initted: init.fixed(&[1], || vec![1.0]),
+                cluster_size: init.fixed(&[codes], || vec![0.0; codes]),
+                embed: init.fixed(&[codes, width], directions),
             },
             settings: settings.clone(),
         }

@@ -173,10 +173,10 @@ impl VqTokenizer {
         };
         let normaliser = Normaliser::new(statistics(MEAN)?, statistics(DEVIATION)?)?;
         let unfit = |error: EngineError| wrong("weights", error.to_string());
-        VqVae::new(&Initialise::planned(compute), &settings, &shape)?
+        VqVae::new(&Initialise::meta(compute), &settings, &shape)?
             .check_shapes(&weights)
             .map_err(unfit)?;
-        let mut model = VqVae::new(&Initialise::to_load(compute), &settings, &shape)?;
+        let mut model = VqVae::new(&Initialise::empty(compute), &settings, &shape)?;
         model.load(&weights).map_err(unfit)?;
         Self::new(&modality, shape, normaliser, &model)
     }

@@ -44,17 +44,17 @@ impl Convolution {
     }
 
     /// Weight and bias uniform in `+- 1 / sqrt(fan in)`, or a Xavier weight.
-    fn new(place: &Initialise<'_>, shape: &[usize], xavier: bool) -> Self {
+    fn new(init: &Initialise<'_>, shape: &[usize], xavier: bool) -> Self {
         let (outputs, kernel) = (shape[0], shape[2..].iter().product::<usize>());
         let fan_in = shape[1] * kernel;
         let bound = 1.0 / (fan_in as f64).sqrt();
         Self {
             weight: if xavier {
-                place.xavier("weight", shape, fan_in, outputs * kernel)
+                init.xavier("weight", shape, fan_in, outputs * kernel)
             } else {
-                place.uniform("weight", shape, bound)
+                init.uniform("weight", shape, bound)
             },
-            bias: place.uniform("bias", &[outputs], bound),
+            bias: init.uniform("bias", &[outputs], bound),
         }
     }
 }
@@ -76,7 +76,7 @@ parameters!(Transformer {
 });
 
 impl Transformer {
-    fn new(place: &Initialise<'_>, settings: &VqSettings, patches: &Patches) -> Self {
+    fn new(init: &Initialise<'_>, settings: &VqSettings, patches: &Patches) -> Self {
         let (width, hidden) = (settings.width, settings.width * settings.mlp_ratio);
         let [rows, columns] = patches.rows_columns();
         let table = || {
@@ -89,14 +89,14 @@ impl Transformer {
         let mut shape = vec![1];
         shape.extend(patches.grid());
         shape.push(width);
-        let blocks = place.at("blocks");
+        let blocks = init.at("blocks");
         Self {
-            position_embeddings: place.fixed(&shape, table),
+            position_embeddings: init.fixed(&shape, table),
             blocks: (0..settings.depth)
                 .map(|i| Block::new(&blocks.item(i), width, settings.heads, hidden))
                 .collect(),
-            norm_mlp: LayerNorm::new(&place.at("norm_mlp"), width, true),
-            post_mlp: Mlp::new(&place.at("post_mlp"), width, hidden, true),
+            norm_mlp: LayerNorm::new(&init.at("norm_mlp"), width, true),
+            post_mlp: Mlp::new(&init.at("post_mlp"), width, hidden, true),
         }
     }
 
@@ -180,13 +180,13 @@ impl VqVae {
     /// # Errors
     /// When the settings do not fit each other or the shape.
     pub fn new(
-        place: &Initialise<'_>,
+        init: &Initialise<'_>,
         settings: &VqSettings,
         shape: &Shape,
     ) -> Result<Self, TokenizerError> {
         let patches = settings.patches(shape)?;
         let (width, code) = (settings.width, settings.code_width);
-        let (encoder, decoder) = (place.at("encoder"), place.at("decoder"));
+        let (encoder, decoder) = (init.at("encoder"), init.at("decoder"));
         let kernel = patches.convolution(width, patches.channels(), true);
         let to_code = patches.convolution(code, width, false);
         let from_code = patches.convolution(width, code, false);
@@ -195,13 +195,13 @@ impl VqVae {
                 conv: Convolution::new(&encoder.at("conv"), &kernel, true),
                 transformer: Transformer::new(&encoder, settings, &patches),
             },
-            quant_proj: Convolution::new(&place.at("quant_proj"), &to_code, false),
-            quantize: Quantizer::new(&place.at("quantize"), &settings.quantizer()),
+            quant_proj: Convolution::new(&init.at("quant_proj"), &to_code, false),
+            quantize: Quantizer::new(&init.at("quantize"), &settings.quantizer()),
             decoder: Decoder {
                 transformer: Transformer::new(&decoder, settings, &patches),
                 out_proj: Linear::new(&decoder.at("out_proj"), width, patches.width(), true),
             },
-            post_quant_proj: Convolution::new(&place.at("post_quant_proj"), &from_code, false),
+            post_quant_proj: Convolution::new(&init.at("post_quant_proj"), &from_code, false),
             patches,
             settings: settings.clone(),
         })
@@ -333,7 +333,7 @@ impl VqVae {
             tokens * width / batch.samples,
             self.patches.values_per_sample(),
         );
-        let order: Vec<i64> = self.patches.positions().map(|place| place as i64).collect();
+        let order: Vec<i64> = self.patches.positions().map(|init| init as i64).collect();
         let order =
             Tensor::<1, Int>::from_data(TensorData::new(order, [values]), &error_NP.device());
         let over_time = |x_NP: Tensor<2>| {
@@ -415,9 +415,9 @@ mod tests {
     use super::*;
     use crate::engine::{Compute, Parameters};
 
-    fn planned(settings: &VqSettings, shape: &Shape) -> VqVae {
+    fn meta(settings: &VqSettings, shape: &Shape) -> VqVae {
         let compute = Compute::cpu();
-        VqVae::new(&Initialise::planned(&compute), settings, shape).unwrap()
+        VqVae::new(&Initialise::meta(&compute), settings, shape).unwrap()
     }
 
     /// Trainable parameters as counted on the released constructors (technical reference, 2.1).

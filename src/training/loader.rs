@@ -1,6 +1,6 @@
 //! Batches, prepared ahead by threads. A batch is a function of the seed and the step: threads only change who waits.
 
-use super::order::Order;
+use super::sampler::Sampler;
 use super::source::{DataError, TokenSample, TokenSource};
 use crate::masking::{Mask, Masking};
 use crate::mget::{Batch, MgetSpec};
@@ -13,7 +13,7 @@ use std::thread::JoinHandle;
 const AHEAD: usize = 2;
 
 /// Everything that decides what a training batch holds.
-pub struct Feed {
+pub struct BatchSource {
     /// The model the batches are for.
     pub spec: MgetSpec,
     /// What is given and what is asked for.
@@ -21,7 +21,7 @@ pub struct Feed {
     /// The data sets.
     pub sources: Vec<Arc<dyn TokenSource>>,
     /// Which clip stands where.
-    pub order: Order,
+    pub order: Sampler,
     /// The seed of the masks.
     pub seed: u64,
     /// Samples of each micro-batch of a step.
@@ -30,15 +30,15 @@ pub struct Feed {
     pub repeat: usize,
 }
 
-impl std::fmt::Debug for Feed {
+impl std::fmt::Debug for BatchSource {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Feed")
+        f.debug_struct("BatchSource")
             .field("order", &self.order)
             .finish_non_exhaustive()
     }
 }
 
-impl Feed {
+impl BatchSource {
     /// Micro-batch `micro` of `step`.
     ///
     /// # Errors
@@ -83,7 +83,7 @@ pub struct Loader {
 impl Loader {
     /// Starts `threads` threads that prepare the micro-batches of steps `steps`.
     #[must_use]
-    pub fn start(feed: &Arc<Feed>, steps: std::ops::Range<u64>, threads: usize) -> Self {
+    pub fn start(feed: &Arc<BatchSource>, steps: std::ops::Range<u64>, threads: usize) -> Self {
         let threads = threads.max(1);
         let mut loader = Self {
             channels: Vec::new(),

@@ -10,7 +10,7 @@
 pub mod kmeans;
 pub mod loader;
 pub mod optimizer;
-pub mod order;
+pub mod sampler;
 pub mod schedule;
 pub mod settings;
 pub mod shards;
@@ -21,11 +21,11 @@ pub mod validation;
 pub mod video_kmeans;
 pub mod video_tokenizer;
 
-pub use loader::{Feed, Loader};
+pub use loader::{BatchSource, Loader};
 pub use optimizer::{AdamW, AdamWSettings};
-pub use order::Order;
+pub use sampler::Sampler;
 pub use schedule::Schedule;
-pub use settings::{Measure, Span, TrainingSettings};
+pub use settings::{DatasetSize, Duration, TrainingSettings};
 pub use shards::Shards;
 pub use source::{DataError, InMemory, TokenSample, TokenSource};
 pub use trainer::{Progress, StepReport, Trainer, TrainingError};

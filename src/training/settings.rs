@@ -22,13 +22,13 @@ pub struct TrainingSettings {
     /// Samples per forward pass; a larger `batch` accumulates gradients. 0 means `batch`.
     pub micro_batch: usize,
     /// Compute the activations of each block once more in backward instead of keeping them: less memory, more time.
-    pub recompute: bool,
+    pub activation_checkpointing: bool,
     /// Peak learning rate. The paper: 1e-4 per 256 samples, so 4e-4 at batch 1024.
     pub learning_rate: f64,
     /// Learning rate at the end.
     pub final_learning_rate: f64,
     /// Linear rise from 0: `{steps: n}`, `{epochs: x}` or `{tokens: n}`.
-    pub warmup: Span,
+    pub warmup: Duration,
     /// What the learning rate does after the warm-up.
     pub schedule: Shape,
     /// AdamW and clipping.
@@ -57,10 +57,10 @@ impl Default for TrainingSettings {
             total_tokens: None,
             batch: 16,
             micro_batch: 0,
-            recompute: false,
+            activation_checkpointing: false,
             learning_rate: 1e-3,
             final_learning_rate: 0.0,
-            warmup: Span::Steps(0),
+            warmup: Duration::Steps(0),
             schedule: Shape::Cosine,
             optimizer: AdamWSettings::default(),
             loss: Loss::Mod,
@@ -76,7 +76,7 @@ impl Default for TrainingSettings {
 /// A stretch of training.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
-pub enum Span {
+pub enum Duration {
     /// In optimizer steps.
     Steps(u64),
     /// In passes over the clips.
@@ -87,7 +87,7 @@ pub enum Span {
 
 /// What spans are measured against.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Measure {
+pub struct DatasetSize {
     /// Clips of one pass over the training data.
     pub clips: u64,
     /// Nominal tokens of one sample, visible plus target.
@@ -112,17 +112,17 @@ impl TrainingSettings {
     ///
     /// # Errors
     /// When the length is given twice or not at all, or is not positive.
-    pub fn total_steps(&self, measure: Measure) -> Result<u64, SettingsError> {
+    pub fn total_steps(&self, measure: DatasetSize) -> Result<u64, SettingsError> {
         let span = match (self.steps, self.epochs, self.total_tokens) {
-            (Some(steps), None, None) => Span::Steps(steps),
-            (None, Some(epochs), None) => Span::Epochs(epochs),
-            (None, None, Some(tokens)) => Span::Tokens(tokens),
+            (Some(steps), None, None) => Duration::Steps(steps),
+            (None, Some(epochs), None) => Duration::Epochs(epochs),
+            (None, None, Some(tokens)) => Duration::Tokens(tokens),
             _ => return Err(SettingsError::Length),
         };
         let name = match span {
-            Span::Steps(_) => "steps",
-            Span::Epochs(_) => "epochs",
-            Span::Tokens(_) => "total_tokens",
+            Duration::Steps(_) => "steps",
+            Duration::Epochs(_) => "epochs",
+            Duration::Tokens(_) => "total_tokens",
         };
         match self.steps_of(span, measure) {
             Some(steps) if steps > 0 => Ok(steps),
@@ -130,18 +130,18 @@ impl TrainingSettings {
         }
     }
 
-    fn steps_of(&self, span: Span, measure: Measure) -> Option<u64> {
+    fn steps_of(&self, span: Duration, measure: DatasetSize) -> Option<u64> {
         let batch = self.batch.max(1) as f64;
         let steps = match span {
-            Span::Steps(steps) => return Some(steps),
+            Duration::Steps(steps) => return Some(steps),
             // A step that is cut off at the end of an epoch is left out, as in the reference.
-            Span::Epochs(epochs) => {
+            Duration::Epochs(epochs) => {
                 epochs
                     * (measure.clips as f64 * self.repeat.max(1) as f64 / batch)
                         .floor()
                         .max(1.0)
             }
-            Span::Tokens(tokens) => tokens / (batch * measure.tokens_per_sample.max(1) as f64),
+            Duration::Tokens(tokens) => tokens / (batch * measure.tokens_per_sample.max(1) as f64),
         };
         (steps.is_finite() && steps >= 0.0).then_some(steps.ceil() as u64)
     }
@@ -150,7 +150,7 @@ impl TrainingSettings {
     ///
     /// # Errors
     /// When length, warm-up, rates or optimizer cannot be used.
-    pub fn learning_rates(&self, measure: Measure) -> Result<Schedule, SettingsError> {
+    pub fn learning_rates(&self, measure: DatasetSize) -> Result<Schedule, SettingsError> {
         for (name, value) in [
             ("batch", self.batch),
             ("repeat", self.repeat),
@@ -206,7 +206,7 @@ impl TrainingSettings {
 mod tests {
     use super::*;
 
-    const PAPER: Measure = Measure {
+    const PAPER: DatasetSize = DatasetSize {
         clips: 1_000_000,
         tokens_per_sample: 4096,
     };
@@ -215,7 +215,7 @@ mod tests {
         TrainingSettings {
             batch: 1024,
             epochs: Some(123.0),
-            warmup: Span::Tokens(10e9),
+            warmup: Duration::Tokens(10e9),
             ..Default::default()
         }
     }
@@ -224,7 +224,7 @@ mod tests {
     fn the_paper_s_run_has_its_published_steps() {
         // The release: 976 steps per epoch, 123 epochs, 2385 steps of warm-up.
         assert_eq!(paper().total_steps(PAPER).unwrap(), 120_048);
-        assert_eq!(paper().steps_of(Span::Tokens(10e9), PAPER), Some(2385));
+        assert_eq!(paper().steps_of(Duration::Tokens(10e9), PAPER), Some(2385));
         let rates = paper().learning_rates(PAPER).unwrap();
         assert!((rates.rate(2384) - 1e-3).abs() < 1e-12);
     }
@@ -242,7 +242,7 @@ mod tests {
         assert!(refused(|s| s.epochs = Some(f64::NAN)));
         assert!(refused(|s| s.learning_rate = f64::INFINITY));
         assert!(refused(|s| s.batch = 0));
-        assert!(refused(|s| s.warmup = Span::Epochs(124.0)));
+        assert!(refused(|s| s.warmup = Duration::Epochs(124.0)));
         assert!(refused(|s| s.final_learning_rate = f64::NAN));
         assert!(refused(|s| s.final_learning_rate = -1e-5));
         assert!(refused(|s| s.optimizer.clip_norm = Some(-1.0)));

@@ -17,7 +17,7 @@ pub struct Trainer {
     schedule: Schedule,
     loss: Loss,
     batch: usize,
-    recompute: bool,
+    activation_checkpointing: bool,
     progress: Progress,
 }
 
@@ -28,7 +28,7 @@ pub struct Progress {
     pub step: u64,
     /// Samples used.
     pub samples: u64,
-    /// Visible tokens that were there, without padding or lost budget.
+    /// EncoderInput tokens that were there, without padding or lost budget.
     pub input_tokens: u64,
     /// Target tokens that were there.
     pub target_tokens: u64,
@@ -84,7 +84,7 @@ impl Trainer {
             schedule,
             loss: settings.loss,
             batch: settings.batch,
-            recompute: settings.recompute,
+            activation_checkpointing: settings.activation_checkpointing,
             progress: Progress::default(),
         }
     }
@@ -147,7 +147,7 @@ impl Trainer {
 
     /// The losses of a batch, and the gradients of `share` times their total, if it has any.
     fn gradients(&self, batch: &Batch, share: f64) -> (LossValues, Option<Gradients>) {
-        if self.recompute {
+        if self.activation_checkpointing {
             return self.model.recomputed(batch, self.loss, share);
         }
         let losses = self.model.losses(batch, self.loss);

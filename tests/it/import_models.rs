@@ -4,7 +4,7 @@ use crate::parity::check_parity;
 use crate::released::{self, Small};
 use crate::shared;
 use reviv::decoding::DecodingSettings;
-use reviv::decoding::reconstructor::{Reconstructor, Wish};
+use reviv::decoding::reconstructor::{GenerationRequest, Reconstructor};
 use reviv::engine::{Compute, Parameters, Weights};
 use reviv::import::{ImportOptions, import};
 use reviv::mget::names::to_release;
@@ -265,16 +265,16 @@ fn an_imported_set_decodes_a_clip_end_to_end() {
     let world = World::new(settings, 7);
     let model = Reconstructor::open(&folder, &Compute::cpu()).unwrap();
     assert_eq!(*model.format(), world.settings().format());
-    let given = ["rgb".to_owned()];
-    let wanted = ["body", "camera", "depth", "gaze", "left_hand", "right_hand"].map(str::to_owned);
-    let wish = Wish {
-        given: &given,
-        wanted: &wanted,
+    let inputs = ["rgb".to_owned()];
+    let targets = ["body", "camera", "depth", "gaze", "left_hand", "right_hand"].map(str::to_owned);
+    let request = GenerationRequest {
+        inputs: &inputs,
+        targets: &targets,
         decoding: &DecodingSettings::default(),
         seed: 0,
     };
     let clips = [world.clip(0), world.clip(1)];
-    let made = model.reconstruct(&clips, &[0, 1], &wish).unwrap();
+    let made = model.reconstruct(&clips, &[0, 1], &request).unwrap();
     for one in &made {
         let clip = &one.clip;
         assert!(clip.camera.is_some() && clip.depth.is_some() && clip.gaze.is_some());

@@ -73,7 +73,7 @@ seed: 0
 stages:
   clips: {op: clips, source: {use: world_small, world: {size: 16, rooms: 2}}, train: 1, validation: 1, test: 2}
   model: {op: import, folder: model}
-  predictions: {op: predict, model: model, clips: clips, given: [rgb], wanted: [camera]}
+  predictions: {op: predict, model: model, clips: clips, inputs: [rgb], targets: [camera]}
   scores: {op: evaluate, predictions: predictions, clips: clips, suite: world_camera}
 ";
 

@@ -48,7 +48,7 @@ stages:
     steps: 3
     batch: 4
     warmup: {steps: 1}
-  predictions: {op: predict, model: mget, clips: clips, given: [camera]}
+  predictions: {op: predict, model: mget, clips: clips, inputs: [camera]}
   scores: {op: evaluate, predictions: predictions, clips: clips, suite: {use: world_camera, metrics: []}}
   table: {op: table, scores: [scores]}
 ";

@@ -2,7 +2,7 @@
 //! the same request gives the same bytes.
 
 use assert_cmd::Command;
-use reviv::decoding::reconstructor::{Binding, TOKENIZERS};
+use reviv::decoding::reconstructor::{ModelManifest, TOKENIZERS};
 use reviv::engine::{Compute, Initialise};
 use reviv::masking::PIXELS;
 use reviv::mget::{Mget, MgetSpec, ModalitySpec, Positions, Size};
@@ -109,7 +109,10 @@ fn model_folder(folder: &Path, seed: u64, known: &[&str], pixels: bool) {
     };
     let model = Mget::new(&spec, &Initialise::new(&compute, seed)).unwrap();
     model.save(folder).unwrap();
-    Binding::of(folder, format).unwrap().write(folder).unwrap();
+    ModelManifest::of(folder, format)
+        .unwrap()
+        .write(folder)
+        .unwrap();
 }
 
 /// A folder of pictures: `frames` of `width` x `height`, in which something moves unless `still`.

@@ -8,7 +8,7 @@ use reviv::run::execute::{Job, Outcome, cache_of, execute};
 use reviv::run::record::RunDirectory;
 use reviv::run::verify::{Check, Redo, Verdict};
 use reviv::run::{
-    Cache, Crew, Interrupt, Progress, RunError, Shard, State, checkpoint, files, metrics,
+    Cache, Interrupt, Progress, RunError, Shard, State, WorkerPool, checkpoint, files, metrics,
 };
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
@@ -234,7 +234,7 @@ fn run_as(
     only: Option<&str>,
     shard: &str,
 ) -> Result<Outcome, RunError> {
-    run_by(experiment, runs, only, shard, Crew::alone())
+    run_by(experiment, runs, only, shard, WorkerPool::alone())
 }
 
 fn run_by(
@@ -242,7 +242,7 @@ fn run_by(
     runs: &Path,
     only: Option<&str>,
     shard: &str,
-    crew: Crew,
+    crew: WorkerPool,
 ) -> Result<Outcome, RunError> {
     execute(&Job {
         experiment,
@@ -414,9 +414,9 @@ fn stages_made_at_the_same_time_have_the_same_bytes() {
     let asked = experiment(cells.into());
     let dirs = [tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap()];
     let outcomes = [1, 4].map(|jobs| {
-        let crew = Crew {
+        let crew = WorkerPool {
             jobs,
-            ..Crew::alone()
+            ..WorkerPool::alone()
         };
         let dir = dirs[usize::from(jobs > 1)].path();
         run_by(&asked, dir, None, "1/1", crew).unwrap()

@@ -3,7 +3,7 @@
 use reviv::experiment::catalog::Catalog;
 use reviv::experiment::load::{Request, load};
 use reviv::run::execute::{Job, Outcome, execute};
-use reviv::run::{Crew, Interrupt, Progress};
+use reviv::run::{Interrupt, Progress, WorkerPool};
 use std::path::Path;
 
 /// Writes `text` into `folder` and runs it there, in `runs`, one stage after the other. What `check` would say is the error.
@@ -21,7 +21,7 @@ pub fn run_text(folder: &Path, text: &str) -> Result<Outcome, String> {
         runs: &folder.join("runs"),
         only: None,
         shard: "1/1".parse().unwrap(),
-        crew: Crew::alone(),
+        crew: WorkerPool::alone(),
         progress: &Progress::silent(),
         interrupt: &Interrupt::default(),
     });

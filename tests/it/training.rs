@@ -7,8 +7,8 @@ use reviv::mget::{Mget, MgetSpec, ModalitySpec, Positions, Size};
 use reviv::random::stream;
 use reviv::tokenizer::TokenGrid;
 use reviv::training::{
-    DataError, Feed, InMemory, Loader, Measure, Order, TokenSample, TokenSource, Trainer,
-    TrainingError, TrainingSettings, Unigram, Validation,
+    BatchSource, DataError, DatasetSize, InMemory, Loader, Order, TokenSample, TokenSource,
+    Trainer, TrainingError, TrainingSettings, Unigram, Validation,
 };
 use std::ops::Range;
 use std::sync::Arc;
@@ -94,7 +94,7 @@ impl Setup {
     fn trainer(&self) -> Trainer {
         let compute = Compute::cpu();
         let model = Mget::new(&spec(), &Initialise::new(&compute, 7)).unwrap();
-        let measure = Measure {
+        let measure = DatasetSize {
             clips: self.source.len() as u64,
             tokens_per_sample: 16,
         };
@@ -105,8 +105,8 @@ impl Setup {
         )
     }
 
-    fn feed(&self) -> Arc<Feed> {
-        Arc::new(Feed {
+    fn feed(&self) -> Arc<BatchSource> {
+        Arc::new(BatchSource {
             spec: spec(),
             masking: Self::masking(),
             order: Order::new(3, &["counting"], &[self.source.len()], None).unwrap(),

@@ -41,7 +41,7 @@ fn every_entry_of_the_released_state_has_its_name_shape_and_kind() {
                 let kind = if columns[3] == "param" {
                     Kind::Trainable
                 } else {
-                    Kind::Fixed
+                    Kind::Buffer
                 };
                 (columns[0].to_owned(), (shape, kind))
             })
@@ -55,7 +55,7 @@ fn every_entry_of_the_released_state_has_its_name_shape_and_kind() {
             },
             ..VqSettings::default()
         };
-        let model = VqVae::new(&Initialise::planned(&compute), &settings, &shape).unwrap();
+        let model = VqVae::new(&Initialise::meta(&compute), &settings, &shape).unwrap();
         let found: BTreeMap<String, (Vec<usize>, Kind)> = model
             .inventory()
             .into_iter()

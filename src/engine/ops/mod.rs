@@ -3,15 +3,15 @@
 //! Shape suffixes: `N` tokens, `D` width, `V` vocabulary, `H` heads. All values f32. Weights are `[out, in]`, as in
 //! checkpoints.
 
-mod composed;
+mod conv_window;
 mod fused;
 mod gemm;
 mod nearest;
-mod taps;
+mod unfused;
 mod vector;
 
+pub use conv_window::ConvWindow;
 pub use nearest::nearest;
-pub use taps::Taps;
 
 use burn::tensor::{Int, Tensor, TensorData};
 
@@ -51,7 +51,7 @@ pub fn linear(x: Tensor<2>, weight: Tensor<2>, bias: Option<Tensor<1>>) -> Tenso
     if fused::takes(&x) {
         return fused::run(Fused::Linear, x, Some(weight), bias);
     }
-    composed::linear(x, weight, bias)
+    unfused::linear(x, weight, bias)
 }
 
 /// Each row to mean 0 and variance 1 (biased, plus `epsilon`), times `weight`, plus `bias`.
@@ -66,7 +66,7 @@ pub fn layer_norm(
         let epsilon = epsilon as f32;
         return fused::run(Fused::LayerNorm { epsilon }, x, Some(weight), bias);
     }
-    composed::layer_norm(x, weight, bias, epsilon)
+    unfused::layer_norm(x, weight, bias, epsilon)
 }
 
 /// Self-attention within segments. `qkv` is `[N, 3 D]` in the layout `[3][heads][D / heads]`; scores are scaled by
@@ -78,7 +78,7 @@ pub fn self_attention(qkv: Tensor<2>, heads: usize, segments: &Segments) -> Tens
         let segments = segments.clone();
         return fused::run(Fused::Attention { heads, segments }, qkv, NONE, NONE);
     }
-    composed::self_attention(qkv, heads, segments)
+    unfused::self_attention(qkv, heads, segments)
 }
 
 /// Cross-attention within segments. `q` is `[N, D]`, `kv` `[M, 2 D]` in the layout `[2][heads][D / heads]`. A segment without
@@ -91,12 +91,12 @@ pub fn cross_attention(
     segments: &Segments,
 ) -> Tensor<2> {
     check_segments(segments, &q, &kv);
-    // Without any key there is no gradient to hand back; the composed form gives the zeros.
+    // Without any key there is no gradient to hand back; the unfused form gives the zeros.
     if fused::takes(&q) && segments.keys() > 0 {
         let segments = segments.clone();
         return fused::run(Fused::Attention { heads, segments }, q, Some(kv), NONE);
     }
-    composed::cross_attention(q, kv, heads, segments)
+    unfused::cross_attention(q, kv, heads, segments)
 }
 
 /// `x Phi(x)` with the exact (erf) normal distribution function.
@@ -125,7 +125,7 @@ pub fn cross_entropy(logits: Tensor<2>, targets: &[u32]) -> Tensor<1> {
         let targets = targets.into();
         return fused::run(Fused::CrossEntropy { targets }, logits, NONE, NONE);
     }
-    composed::cross_entropy(logits, targets)
+    unfused::cross_entropy(logits, targets)
 }
 
 /// [`cross_entropy`] of the logits `x table^T`, without keeping all of them: `x` is `[N, D]`, `table` `[V, D]`. Gives `[N]`.
@@ -136,7 +136,7 @@ pub fn tied_cross_entropy(x: Tensor<2>, table: Tensor<2>, targets: &[u32]) -> Te
         let targets = targets.into();
         return fused::run(Fused::TiedCrossEntropy { targets }, x, Some(table), NONE);
     }
-    composed::cross_entropy(composed::linear(x, table, None), targets)
+    unfused::cross_entropy(unfused::linear(x, table, None), targets)
 }
 
 /// A factorised causal convolution over video on packed rows: `x` `[N, C]`, one row per pixel of
@@ -146,13 +146,13 @@ pub fn tied_cross_entropy(x: Tensor<2>, table: Tensor<2>, targets: &[u32]) -> Te
 /// # Panics
 /// When `x` does not have the rows that `taps` speaks of.
 #[must_use]
-pub fn convolve(x: Tensor<2>, weight: Tensor<2>, bias: Tensor<1>, taps: Taps) -> Tensor<2> {
+pub fn convolve(x: Tensor<2>, weight: Tensor<2>, bias: Tensor<1>, taps: ConvWindow) -> Tensor<2> {
     assert_eq!(x.dims()[0], taps.rows_in(), "{taps:?}");
     assert_eq!(weight.dims()[1], x.dims()[1] * taps.count(), "{taps:?}");
     if fused::takes(&x) {
         return fused::run(Fused::Convolution { taps }, x, Some(weight), Some(bias));
     }
-    composed::convolve(x, weight, bias, taps)
+    unfused::convolve(x, weight, bias, taps)
 }
 
 /// Each of `frames` frames of packed rows `[frames * pixels, channels]` to mean 0 and variance 1 (group norm with one group),
@@ -173,7 +173,7 @@ pub fn frame_norm(
         let operation = Fused::FrameNorm { frames, silu };
         return fused::run(operation, x, Some(weight), Some(bias));
     }
-    composed::frame_norm(x, weight, bias, frames, silu)
+    unfused::frame_norm(x, weight, bias, frames, silu)
 }
 
 /// The rows `ids` of `table` `[V, D]`: `[N, D]`.
@@ -200,7 +200,7 @@ pub fn sum_of_squares(x: Tensor<1>) -> f64 {
     if fused::takes(&x) {
         return fused::sum_of_squares(x.without_autodiff());
     }
-    composed::sum_of_squares(x)
+    unfused::sum_of_squares(x)
 }
 
 /// The scalars of one AdamW step of one parameter, bias corrections included.
@@ -230,5 +230,5 @@ pub fn adamw(
     if fused::takes(&values) {
         return fused::adamw(values, gradient, mean, square, step);
     }
-    composed::adamw(values, gradient, mean, square, step)
+    unfused::adamw(values, gradient, mean, square, step)
 }

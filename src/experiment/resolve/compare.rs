@@ -5,7 +5,7 @@ use crate::experiment::diagnostic::Diagnostic;
 use crate::experiment::graph::Compare;
 use crate::experiment::names;
 use crate::experiment::problem::Code;
-use crate::experiment::typed::Typer;
+use crate::experiment::typed::Validator;
 use crate::experiment::yaml::Node;
 use std::collections::BTreeMap;
 
@@ -13,7 +13,7 @@ impl Resolver<'_> {
     /// The `compare:` block of a sweep.
     pub fn compare(&mut self, node: &Node, rows: &[String], columns: &[String]) -> Option<Compare> {
         let schema = self.catalog.definition("compare")?;
-        let mut typer = Typer {
+        let mut typer = Validator {
             catalog: self.catalog,
             registry: self.registry,
             sources: self.sources,

@@ -7,7 +7,7 @@ use crate::experiment::names;
 use crate::experiment::problem::Code;
 use crate::experiment::stage::AnyOp;
 use crate::experiment::sweep;
-use crate::experiment::typed::{Trace, Typer};
+use crate::experiment::typed::{Trace, Validator};
 use crate::experiment::yaml::{Data, Item, Node};
 use serde_json::Value;
 use std::collections::BTreeMap;
@@ -70,7 +70,7 @@ impl Resolver<'_> {
         let mut beside = vec!["op", "seed"];
         beside.extend(ports.iter().map(|port| port.name));
         let schema = self.catalog.schema(op.name())?;
-        let mut typer = Typer {
+        let mut typer = Validator {
             catalog: self.catalog,
             registry: self.registry,
             sources: self.sources,

@@ -1,13 +1,13 @@
 //! Values of several forms: enums in each of the ways in which a schema writes them.
 
-use super::{Typer, below, last, wrong_type};
+use super::{Validator, below, last, wrong_type};
 use crate::experiment::diagnostic::Diagnostic;
 use crate::experiment::names;
 use crate::experiment::problem::Code;
 use crate::experiment::yaml::{Data, Node};
 use serde_json::Value;
 
-impl<'c> Typer<'c, '_> {
+impl<'c> Validator<'c, '_> {
     /// A value that may have one of several forms.
     pub(super) fn choice(
         &mut self,
@@ -81,7 +81,7 @@ impl<'c> Typer<'c, '_> {
         let traces = self.traces.clone();
         for choice in &choices {
             let mut diagnostics = Vec::new();
-            let mut inner = Typer {
+            let mut inner = Validator {
                 catalog: self.catalog,
                 registry: self.registry,
                 sources: self.sources,

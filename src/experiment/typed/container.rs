@@ -1,13 +1,13 @@
 //! Lists and maps: how many, which keys, which are missing.
 
-use super::{ANYTHING, Typer, below, last};
+use super::{ANYTHING, Validator, below, last};
 use crate::experiment::diagnostic::Diagnostic;
 use crate::experiment::names;
 use crate::experiment::problem::Code;
 use crate::experiment::yaml::{Data, Item, Node};
 use serde_json::{Map, Value};
 
-impl<'c> Typer<'c, '_> {
+impl<'c> Validator<'c, '_> {
     pub(super) fn list(
         &mut self,
         schema: &'c Value,

@@ -1,6 +1,6 @@
 //! What a value refers to: an entry of the registry, or a file.
 
-use super::{Typer, below, last, wrong_type};
+use super::{Validator, below, last, wrong_type};
 use crate::experiment::diagnostic::Diagnostic;
 use crate::experiment::merge;
 use crate::experiment::problem::Code;
@@ -9,7 +9,7 @@ use crate::experiment::yaml::{Data, Item, Node};
 use serde_json::{Map, Value};
 use std::path::Path;
 
-impl<'c> Typer<'c, '_> {
+impl<'c> Validator<'c, '_> {
     pub(super) fn path(&mut self, node: &Node, path: &str, optional: bool) -> Option<Value> {
         if node.data == Data::Null && optional {
             return Some(Value::Null);

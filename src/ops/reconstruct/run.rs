@@ -3,13 +3,13 @@
 use super::ReconstructSettings;
 use super::recording::{Recording, input};
 use crate::clip::Clip;
-use crate::decoding::{Reconstructor, Wish};
+use crate::decoding::{GenerationRequest, Reconstructor};
 use crate::engine::Compute;
 use crate::experiment::{StageContext, StageError};
 use crate::masking::PIXELS;
 use crate::ops::predict::refused;
 use crate::reconstruction::anchor;
-use crate::reconstruction::folder::{FOLDER, Folder, Setting};
+use crate::reconstruction::folder::{FOLDER, Folder, ReconstructionInfo};
 use crate::reconstruction::windows::{samples_of, windows};
 use crate::run::environment::Stopwatch;
 use crate::view::Fact;
@@ -63,27 +63,27 @@ pub(super) fn run(
         })
         .map_err(refused)?;
     let format = reconstructor.format().clone();
-    let wanted: Vec<String> = if settings.wanted.is_empty() {
+    let targets: Vec<String> = if settings.targets.is_empty() {
         let others = reconstructor.names().filter(|name| *name != "rgb");
         others.map(ToOwned::to_owned).collect()
     } else {
-        settings.wanted.clone()
+        settings.targets.clone()
     };
-    let given = if settings.given.is_empty() {
+    let inputs = if settings.inputs.is_empty() {
         let tokens = reconstructor.names().any(|name| name == "rgb");
         vec![if tokens { "rgb" } else { PIXELS }.to_owned()]
     } else {
-        settings.given.clone()
+        settings.inputs.clone()
     };
     let clips = context.inputs("clips").first().cloned();
     let recording = Recording::open(settings, clips.as_ref(), &format)?;
     let list = windows(recording.seconds, settings.overlap)
         .map_err(|error| input(error, "choose another `overlap`"))?;
-    let has = |name: &str| wanted.iter().any(|wanted| wanted == name);
+    let has = |name: &str| targets.iter().any(|wanted| targets == name);
     if list.len() > 1 && has("body") && !has("camera") {
         return Err(input(
             "`body` over several windows needs the camera path, which says where each window starts",
-            "add `camera` to `wanted`",
+            "add `camera` to `targets`",
         ));
     }
     let samples = samples_of(recording.seconds);
@@ -106,7 +106,7 @@ pub(super) fn run(
         .map(|path| anchor::read(path.as_ref(), frames))
         .transpose()
         .map_err(|error| input(error, "see `anchor` in `reviv show reconstruct`"))?;
-    let setting = Setting {
+    let setting = ReconstructionInfo {
         title: recording.title.clone(),
         video_rate: rate,
         frames,
@@ -121,9 +121,9 @@ pub(super) fn run(
     };
     let mut folder =
         Folder::new(&context.output().join(FOLDER), setting).map_err(StageError::other)?;
-    let wish = Wish {
-        given: &given,
-        wanted: &wanted,
+    let request = GenerationRequest {
+        inputs: &inputs,
+        targets: &targets,
         decoding: &settings.decoding.settings,
         seed: context.seed(),
     };
@@ -137,7 +137,7 @@ pub(super) fn run(
         clip.rgb = Some(rgb.clone());
         let made = times
             .take("decode", || {
-                reconstructor.reconstruct(&[clip], &[window.index as u64], &wish)
+                reconstructor.reconstruct(&[clip], &[window.index as u64], &request)
             })
             .map_err(refused)?;
         for one in made {
@@ -156,7 +156,7 @@ pub(super) fn run(
     Ok(json!({
         "seconds": recording.seconds,
         "windows": list.len(),
-        "modalities": wanted,
+        "modalities": targets,
         "scale": manifest.scale,
         "files": manifest.files,
     }))

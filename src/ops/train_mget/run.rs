@@ -1,7 +1,7 @@
 //! Running `op: train_mget`: what arrives, the loop, what leaves.
 
 use super::{TrainMgetSettings, measure, spec};
-use crate::decoding::reconstructor::{Binding, TOKENIZERS};
+use crate::decoding::reconstructor::{ModelManifest, TOKENIZERS};
 use crate::engine::{Compute, Initialise};
 use crate::experiment::{Code, InputArtifact, StageContext, StageError, TokenFacts};
 use crate::masking::{Masking, PIXELS};
@@ -11,8 +11,8 @@ use crate::run::checkpoint;
 use crate::run::environment::Stopwatch;
 use crate::run::files::copy_tree;
 use crate::training::{
-    DataError, Feed, Loader, Order, Score, Shards, StepReport, TokenSource, Trainer, TrainingError,
-    TrainingSettings, Unigram, Validation,
+    BatchSource, DataError, Loader, Sampler, Score, Shards, StepReport, TokenSource, Trainer,
+    TrainingError, TrainingSettings, Unigram, Validation,
 };
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
@@ -51,7 +51,7 @@ fn input_error(error: impl Into<TrainingError>) -> StageError {
 /// A stage under way.
 pub(super) struct Run {
     trainer: Trainer,
-    feed: Arc<Feed>,
+    feed: Arc<BatchSource>,
     validation: Validation,
     baseline: BTreeMap<String, Score>,
     settings: TrainingSettings,
@@ -95,7 +95,7 @@ impl Run {
             .map(|source| settings.used(source.len() as u64) as usize)
             .collect();
         let weights = (!settings.weights.is_empty()).then_some(settings.weights.as_slice());
-        let order = Order::new(seed, &names, &lengths, weights).map_err(input_error)?;
+        let order = Sampler::new(seed, &names, &lengths, weights).map_err(input_error)?;
         let training = &settings.training;
         let schedule = training
             .learning_rates(measure(settings, lengths.iter().sum::<usize>() as u64))
@@ -137,7 +137,7 @@ impl Run {
         let tokenizers = Some(first.path.join(TOKENIZERS)).filter(|path| path.is_dir());
         Ok(Self {
             trainer,
-            feed: Arc::new(Feed {
+            feed: Arc::new(BatchSource {
                 spec,
                 masking: masking.clone(),
                 sources,
@@ -305,7 +305,7 @@ impl Run {
             copy_tree(tokenizers, &output.join(TOKENIZERS)).map_err(StageError::other)?;
         }
         if let Some(clips) = self.clips {
-            let binding = Binding::of(&output, clips).map_err(StageError::other)?;
+            let binding = ModelManifest::of(&output, clips).map_err(StageError::other)?;
             binding.write(&output).map_err(StageError::other)?;
         }
         Ok(json!({
@@ -325,7 +325,7 @@ fn same_tokenizers(spec: &MgetSpec, artifacts: &[InputArtifact]) -> Result<(), S
     let Some((first, others)) = artifacts.split_first().filter(|(_, o)| !o.is_empty()) else {
         return Ok(());
     };
-    let digests = |artifact: &InputArtifact| Binding::digests(&artifact.path);
+    let digests = |artifact: &InputArtifact| ModelManifest::digests(&artifact.path);
     let known = digests(first).map_err(StageError::other)?;
     for other in others {
         let found = digests(other).map_err(StageError::other)?;

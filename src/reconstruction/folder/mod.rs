@@ -10,12 +10,12 @@ use super::cloud::{lift, ray};
 use super::depth::{DepthSeam, DepthStitcher};
 use super::export::manifest::ArrayFacts;
 use super::export::ply::Point;
+use super::frame_buffer::DepthSpool;
 use super::predictions::ScaleStatus;
 use super::scale::{
     DepthFit, DepthRay, FloorFit, ScaleRefusal, fit_anchor, fit_floor, floor_height,
 };
-use super::spool::DepthSpool;
-use super::stitch::{Seam, Stitcher, Tracks, gravity_to_world};
+use super::stitch::{Stitcher, Tracks, WindowBoundary, gravity_to_world};
 use super::windows::Window;
 use crate::clip::clock::{SIGNAL_RATE, SIGNAL_SAMPLES};
 use crate::clip::{Clip, Intrinsics};
@@ -43,7 +43,7 @@ const NEAREST: f32 = 0.01;
 
 /// What is known, or assumed, before the first window.
 #[derive(Debug, Clone)]
-pub struct Setting {
+pub struct ReconstructionInfo {
     pub title: String,
     /// Hz of the model's video.
     pub video_rate: f64,
@@ -96,7 +96,7 @@ pub struct Manifest {
     /// Why depth stayed relative.
     pub refused: Option<String>,
     pub arrays: Vec<ArrayFacts>,
-    pub seams: Vec<Seam>,
+    pub seams: Vec<WindowBoundary>,
     pub depth_seams: Vec<DepthSeam>,
     /// Mean confidence by modality: from token entropies, 0 (a guess) to 1 (certain). Not an accuracy.
     pub confidence: BTreeMap<String, f64>,
@@ -107,7 +107,7 @@ pub struct Manifest {
 #[derive(Debug)]
 pub struct Folder {
     path: PathBuf,
-    setting: Setting,
+    setting: ReconstructionInfo,
     stitcher: Stitcher,
     depth: DepthStitcher,
     spool: DepthSpool,
@@ -123,7 +123,7 @@ impl Folder {
     ///
     /// # Errors
     /// When it cannot be made or written to.
-    pub fn new(path: &Path, setting: Setting) -> Result<Self, FolderError> {
+    pub fn new(path: &Path, setting: ReconstructionInfo) -> Result<Self, FolderError> {
         let io = |error| FolderError::Io {
             path: path.to_owned(),
             error,

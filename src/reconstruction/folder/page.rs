@@ -6,7 +6,7 @@ use crate::geometry::skeleton::JOINTS;
 use crate::reconstruction::depth::stack;
 use crate::reconstruction::export::ply::Point;
 use crate::reconstruction::predictions::ScaleStatus;
-use crate::reconstruction::stitch::{Joints, Seam, Stitcher, Tracks};
+use crate::reconstruction::stitch::{Joints, Stitcher, Tracks, WindowBoundary};
 use crate::reconstruction::windows::Window;
 use crate::view::scene::Tone;
 use crate::view::{Badge, Confidence, DepthGrids, Fact, Scene, Track};
@@ -107,8 +107,8 @@ fn fact(label: &str, value: &str) -> Fact {
     }
 }
 
-fn worst_seam(seams: &[Seam]) -> Option<String> {
-    let size = |seam: &Seam| {
+fn worst_seam(seams: &[WindowBoundary]) -> Option<String> {
+    let size = |seam: &WindowBoundary| {
         let parts = [seam.body_m, seam.camera_m, seam.hands_m];
         parts.into_iter().flatten().fold(0.0, f64::max)
     };

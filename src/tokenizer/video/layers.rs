@@ -3,7 +3,7 @@
 use burn::tensor::{Bool, Tensor, TensorData, activation::softmax};
 
 use super::settings::Resampling;
-use crate::engine::ops::{self, Taps};
+use crate::engine::ops::{self, ConvWindow};
 use crate::engine::{Initialise, Parameter, Segments, parameters};
 
 /// Where the rows of an activation lie.
@@ -28,8 +28,8 @@ impl Extent {
         self.samples * self.frames * self.pixels()
     }
 
-    fn space(self, stride: usize) -> Taps {
-        Taps::Space {
+    fn space(self, stride: usize) -> ConvWindow {
+        ConvWindow::Space {
             frames: self.samples * self.frames,
             height: self.height,
             width: self.width,
@@ -37,8 +37,8 @@ impl Extent {
         }
     }
 
-    fn time(self, stride: usize) -> Taps {
-        Taps::Time {
+    fn time(self, stride: usize) -> ConvWindow {
+        ConvWindow::Time {
             samples: self.samples,
             frames: self.frames,
             pixels: self.pixels(),
@@ -73,7 +73,7 @@ impl Conv {
     /// Weight uniform in `+- sqrt(3 / fan in)`, so that activations keep their variance through dozens of convolutions; bias
     /// uniform in `+- 1 / sqrt(fan in)`, so that the norms have something to divide by where a frame is black.
     #[must_use]
-    pub fn new(place: &Initialise<'_>, inputs: usize, outputs: usize, kernel: Kernel) -> Self {
+    pub fn new(init: &Initialise<'_>, inputs: usize, outputs: usize, kernel: Kernel) -> Self {
         let size = match kernel {
             Kernel::Point => [1, 1, 1],
             Kernel::Space => [1, 3, 3],
@@ -83,8 +83,8 @@ impl Conv {
         let bound = (3.0 / fan_in as f64).sqrt();
         let shape = [outputs, inputs, size[0], size[1], size[2]];
         Self {
-            weight: place.uniform("conv3d.weight", &shape, bound),
-            bias: place.uniform("conv3d.bias", &[outputs], (fan_in as f64).powf(-0.5)),
+            weight: init.uniform("conv3d.weight", &shape, bound),
+            bias: init.uniform("conv3d.bias", &[outputs], (fan_in as f64).powf(-0.5)),
             kernel,
         }
     }
@@ -115,10 +115,10 @@ pub type Factorised = Vec<Conv>;
 
 /// Space from `inputs` to `outputs`, then time.
 #[must_use]
-pub fn factorised(place: &Initialise<'_>, inputs: usize, outputs: usize) -> Factorised {
+pub fn factorised(init: &Initialise<'_>, inputs: usize, outputs: usize) -> Factorised {
     vec![
-        Conv::new(&place.item(0), inputs, outputs, Kernel::Space),
-        Conv::new(&place.item(1), outputs, outputs, Kernel::Time),
+        Conv::new(&init.item(0), inputs, outputs, Kernel::Space),
+        Conv::new(&init.item(1), outputs, outputs, Kernel::Time),
     ]
 }
 
@@ -141,10 +141,10 @@ parameters!(Norm { weight => "norm.weight", bias => "norm.bias" });
 impl Norm {
     /// Weight 1, bias 0.
     #[must_use]
-    pub fn new(place: &Initialise<'_>, channels: usize) -> Self {
+    pub fn new(init: &Initialise<'_>, channels: usize) -> Self {
         Self {
-            weight: place.constant(&[channels], 1.0),
-            bias: place.constant(&[channels], 0.0),
+            weight: init.constant(&[channels], 1.0),
+            bias: init.constant(&[channels], 0.0),
         }
     }
 
@@ -180,14 +180,14 @@ parameters!(ResBlock {
 
 impl ResBlock {
     #[must_use]
-    pub fn new(place: &Initialise<'_>, inputs: usize, outputs: usize) -> Self {
+    pub fn new(init: &Initialise<'_>, inputs: usize, outputs: usize) -> Self {
         Self {
-            norm1: Norm::new(&place.at("norm1"), inputs),
-            conv1: factorised(&place.at("conv1"), inputs, outputs),
-            norm2: Norm::new(&place.at("norm2"), outputs),
-            conv2: factorised(&place.at("conv2"), outputs, outputs),
+            norm1: Norm::new(&init.at("norm1"), inputs),
+            conv1: factorised(&init.at("conv1"), inputs, outputs),
+            norm2: Norm::new(&init.at("norm2"), outputs),
+            conv2: factorised(&init.at("conv2"), outputs, outputs),
             nin_shortcut: (inputs != outputs)
-                .then(|| Conv::new(&place.at("nin_shortcut"), inputs, outputs, Kernel::Point)),
+                .then(|| Conv::new(&init.at("nin_shortcut"), inputs, outputs, Kernel::Point)),
         }
     }
 
@@ -235,10 +235,10 @@ parameters!(Attention {
 
 impl Attention {
     #[must_use]
-    pub fn new(place: &Initialise<'_>, channels: usize, attends: Attends) -> Self {
-        let conv = |name: &str| Conv::new(&place.at(name), channels, channels, Kernel::Point);
+    pub fn new(init: &Initialise<'_>, channels: usize, attends: Attends) -> Self {
+        let conv = |name: &str| Conv::new(&init.at(name), channels, channels, Kernel::Point);
         Self {
-            norm: Norm::new(&place.at("norm"), channels),
+            norm: Norm::new(&init.at("norm"), channels),
             q: conv("q"),
             k: conv("k"),
             v: conv("v"),
@@ -313,8 +313,8 @@ parameters!(Downsample {
 impl Downsample {
     /// `None` where nothing is resampled.
     #[must_use]
-    pub fn new(place: &Initialise<'_>, channels: usize, way: Resampling) -> Option<Self> {
-        let conv = |name: &str, kernel| Conv::new(&place.at(name), channels, channels, kernel);
+    pub fn new(init: &Initialise<'_>, channels: usize, way: Resampling) -> Option<Self> {
+        let conv = |name: &str, kernel| Conv::new(&init.at(name), channels, channels, kernel);
         (way != Resampling::default()).then(|| Self {
             conv1: way.space.then(|| conv("conv1", Kernel::Space)),
             conv2: way.time.then(|| conv("conv2", Kernel::Time)),
@@ -389,8 +389,8 @@ parameters!(Upsample {
 impl Upsample {
     /// `None` where nothing is resampled.
     #[must_use]
-    pub fn new(place: &Initialise<'_>, channels: usize, way: Resampling) -> Option<Self> {
-        let conv = |name: &str, kernel| Conv::new(&place.at(name), channels, channels, kernel);
+    pub fn new(init: &Initialise<'_>, channels: usize, way: Resampling) -> Option<Self> {
+        let conv = |name: &str, kernel| Conv::new(&init.at(name), channels, channels, kernel);
         (way != Resampling::default()).then(|| Self {
             conv1: way.time.then(|| conv("conv1", Kernel::Time)),
             conv2: way.space.then(|| conv("conv2", Kernel::Space)),

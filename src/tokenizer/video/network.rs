@@ -40,15 +40,15 @@ parameters!(Middle {
 });
 
 impl Middle {
-    fn new(place: &Initialise<'_>, channels: usize) -> Self {
-        let attention = place.at("attn_1");
+    fn new(init: &Initialise<'_>, channels: usize) -> Self {
+        let attention = init.at("attn_1");
         Self {
-            block_1: ResBlock::new(&place.at("block_1"), channels, channels),
+            block_1: ResBlock::new(&init.at("block_1"), channels, channels),
             attn_1: vec![
                 Attention::new(&attention.item(0), channels, Attends::Space),
                 Attention::new(&attention.item(1), channels, Attends::Time),
             ],
-            block_2: ResBlock::new(&place.at("block_2"), channels, channels),
+            block_2: ResBlock::new(&init.at("block_2"), channels, channels),
         }
     }
 
@@ -93,34 +93,34 @@ parameters!(Encoder {
 });
 
 impl Encoder {
-    fn new(place: &Initialise<'_>, settings: &VideoSettings) -> Self {
+    fn new(init: &Initialise<'_>, settings: &VideoSettings) -> Self {
         let mut width = settings.channels;
         let down = (0..settings.multipliers.len())
             .map(|level| {
-                let place = place.at("down").item(level);
+                let init = init.at("down").item(level);
                 let block = (0..settings.blocks)
                     .map(|i| {
                         let inputs = std::mem::replace(&mut width, settings.width(level));
-                        ResBlock::new(&place.at("block").item(i), inputs, width)
+                        ResBlock::new(&init.at("block").item(i), inputs, width)
                     })
                     .collect();
                 let way = settings.down(level);
                 Down {
                     block,
-                    downsample: Downsample::new(&place.at("downsample"), width, way),
+                    downsample: Downsample::new(&init.at("downsample"), width, way),
                 }
             })
             .collect();
         Self {
             conv_in: factorised(
-                &place.at("conv_in"),
+                &init.at("conv_in"),
                 settings.coefficients(),
                 settings.channels,
             ),
             down,
-            mid: Middle::new(&place.at("mid"), width),
-            norm_out: Norm::new(&place.at("norm_out"), width),
-            conv_out: factorised(&place.at("conv_out"), width, settings.latent_channels),
+            mid: Middle::new(&init.at("mid"), width),
+            norm_out: Norm::new(&init.at("norm_out"), width),
+            conv_out: factorised(&init.at("conv_out"), width, settings.latent_channels),
         }
     }
 
@@ -158,33 +158,33 @@ parameters!(Decoder {
 });
 
 impl Decoder {
-    fn new(place: &Initialise<'_>, settings: &VideoSettings) -> Self {
+    fn new(init: &Initialise<'_>, settings: &VideoSettings) -> Self {
         let levels = settings.multipliers.len();
         let widest = settings.width(levels - 1);
         let mut width = widest;
         let mut up: Vec<Up> = (0..levels)
             .rev()
             .map(|level| {
-                let place = place.at("up").item(level);
+                let init = init.at("up").item(level);
                 let block = (0..=settings.blocks)
                     .map(|i| {
                         let inputs = std::mem::replace(&mut width, settings.width(level));
-                        ResBlock::new(&place.at("block").item(i), inputs, width)
+                        ResBlock::new(&init.at("block").item(i), inputs, width)
                     })
                     .collect();
                 Up {
                     block,
-                    upsample: Upsample::new(&place.at("upsample"), width, settings.up(level)),
+                    upsample: Upsample::new(&init.at("upsample"), width, settings.up(level)),
                 }
             })
             .collect();
         up.reverse();
         Self {
-            conv_in: factorised(&place.at("conv_in"), settings.latent_channels, widest),
-            mid: Middle::new(&place.at("mid"), widest),
+            conv_in: factorised(&init.at("conv_in"), settings.latent_channels, widest),
+            mid: Middle::new(&init.at("mid"), widest),
             up,
-            norm_out: Norm::new(&place.at("norm_out"), width),
-            conv_out: factorised(&place.at("conv_out"), width, settings.coefficients()),
+            norm_out: Norm::new(&init.at("norm_out"), width),
+            conv_out: factorised(&init.at("conv_out"), width, settings.coefficients()),
         }
     }
 
@@ -209,17 +209,16 @@ impl Network {
     ///
     /// # Errors
     /// When the sizes do not fit each other.
-    pub fn new(place: &Initialise<'_>, settings: &VideoSettings) -> Result<Self, TokenizerError> {
+    pub fn new(init: &Initialise<'_>, settings: &VideoSettings) -> Result<Self, TokenizerError> {
         settings.check()?;
         let (latent, code) = (settings.latent_channels, settings.levels.len());
-        let conv = |name: &str, inputs, outputs| {
-            Conv::new(&place.at(name), inputs, outputs, Kernel::Point)
-        };
+        let conv =
+            |name: &str, inputs, outputs| Conv::new(&init.at(name), inputs, outputs, Kernel::Point);
         Ok(Self {
-            encoder: Encoder::new(&place.at("encoder"), settings),
+            encoder: Encoder::new(&init.at("encoder"), settings),
             quant_conv: conv("quant_conv", latent, code),
             post_quant_conv: conv("post_quant_conv", code, latent),
-            decoder: Decoder::new(&place.at("decoder"), settings),
+            decoder: Decoder::new(&init.at("decoder"), settings),
             settings: settings.clone(),
         })
     }
@@ -321,7 +320,7 @@ mod tests {
                 ..settings
             };
             let compute = Compute::cpu();
-            let network = Network::new(&Initialise::to_load(&compute), &narrow).unwrap();
+            let network = Network::new(&Initialise::empty(&compute), &narrow).unwrap();
             assert_eq!(network.count(), expected(&narrow));
         }
     }

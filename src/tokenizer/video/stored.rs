@@ -80,10 +80,10 @@ impl VideoTokenizer {
             .map_err(|error| wrong("clip", error.to_string()))?;
         let statistics = [MEAN, DEVIATION].map(|name| weights.tensors.remove(name));
         let unfit = |error: EngineError| wrong("weights", error.to_string());
-        Network::new(&Initialise::planned(compute), &settings)?
+        Network::new(&Initialise::meta(compute), &settings)?
             .check_shapes(&weights)
             .map_err(unfit)?;
-        let mut network = Network::new(&Initialise::to_load(compute), &settings)?;
+        let mut network = Network::new(&Initialise::empty(compute), &settings)?;
         network.load(&weights).map_err(unfit)?;
         let mut tokenizer = Self::new(&modality, clip, network, compute)?;
         match statistics {

@@ -3,8 +3,8 @@
 
 use rayon::prelude::*;
 
+use super::super::conv_window::ConvWindow;
 use super::super::gemm::{Matrix, Threads, gemm, gemm_into};
-use super::super::taps::Taps;
 use super::{Array, Kernel, Saved};
 
 /// Output rows per task: fixed, so results do not depend on the number of threads.
@@ -14,7 +14,7 @@ const GROUPS: usize = 8;
 
 #[derive(Debug)]
 pub struct Convolution {
-    pub taps: Taps,
+    pub taps: ConvWindow,
 }
 
 impl Kernel for Convolution {
@@ -46,13 +46,13 @@ struct Operands<'a> {
     x: &'a [f32],
     /// `[O, C * taps]`, channel by tap.
     weight: &'a [f32],
-    taps: Taps,
+    taps: ConvWindow,
     channels: usize,
     outputs: usize,
 }
 
 impl<'a> Operands<'a> {
-    fn new(x: &'a Array, weight: &'a Array, taps: Taps) -> Self {
+    fn new(x: &'a Array, weight: &'a Array, taps: ConvWindow) -> Self {
         Self {
             x: x.values(),
             weight: weight.values(),

@@ -26,7 +26,7 @@ use burn_flex::FlexTensor;
 pub use flat::{adamw, sum_of_squares};
 
 use super::super::Segments;
-use super::{Taps, vector};
+use super::{ConvWindow, vector};
 
 /// An array on the host: dense, row-major, f32.
 #[derive(Debug, Clone)]
@@ -94,7 +94,7 @@ pub enum Fused {
     SwiGlu,
     CrossEntropy { targets: Arc<[u32]> },
     TiedCrossEntropy { targets: Arc<[u32]> },
-    Convolution { taps: Taps },
+    Convolution { taps: ConvWindow },
     FrameNorm { frames: usize, silu: bool },
 }
 
@@ -208,7 +208,7 @@ pub fn run<const A: usize, const B: usize, const C: usize, const OUT: usize>(
 mod tests {
     use burn::tensor::{Tensor, TensorData};
 
-    use super::super::{self as ops, composed};
+    use super::super::{self as ops, unfused};
     use super::*;
     use crate::engine::Segment;
     use crate::engine::parameters::to_host;
@@ -285,27 +285,27 @@ mod tests {
         x.unsqueeze()
     }
 
-    /// Taps with several blocks of rows and several units, and with a stride.
-    const TAPS: [Taps; 4] = [
-        Taps::Space {
+    /// ConvWindow with several blocks of rows and several units, and with a stride.
+    const TAPS: [ConvWindow; 4] = [
+        ConvWindow::Space {
             frames: 3,
             height: 13,
             width: 14,
             stride: 1,
         },
-        Taps::Space {
+        ConvWindow::Space {
             frames: 3,
             height: 4,
             width: 6,
             stride: 2,
         },
-        Taps::Time {
+        ConvWindow::Time {
             samples: 1,
             frames: 3,
             pixels: 260,
             stride: 1,
         },
-        Taps::Time {
+        ConvWindow::Time {
             samples: 2,
             frames: 6,
             pixels: 5,
@@ -313,13 +313,13 @@ mod tests {
         },
     ];
 
-    type Convolve = fn(Tensor<2>, Tensor<2>, Tensor<1>, Taps) -> Tensor<2>;
+    type Convolve = fn(Tensor<2>, Tensor<2>, Tensor<1>, ConvWindow) -> Tensor<2>;
 
-    fn convolved(x: &[Tensor<2>], convolve: Convolve, taps: Taps) -> Tensor<2> {
+    fn convolved(x: &[Tensor<2>], convolve: Convolve, taps: ConvWindow) -> Tensor<2> {
         convolve(x[0].clone(), x[1].clone(), flat(&x[2]), taps)
     }
 
-    fn video(taps: Taps) -> Vec<Tensor<2>> {
+    fn video(taps: ConvWindow) -> Vec<Tensor<2>> {
         vec![
             wave([taps.rows_in(), 3], 0.0),
             wave([5, 3 * taps.count()], 1.0),
@@ -333,25 +333,25 @@ mod tests {
                 "convolution in space",
                 video(TAPS[0]),
                 |x| convolved(x, ops::convolve, TAPS[0]),
-                |x| convolved(x, composed::convolve, TAPS[0]),
+                |x| convolved(x, unfused::convolve, TAPS[0]),
             ),
             (
                 "convolution in space with a stride",
                 video(TAPS[1]),
                 |x| convolved(x, ops::convolve, TAPS[1]),
-                |x| convolved(x, composed::convolve, TAPS[1]),
+                |x| convolved(x, unfused::convolve, TAPS[1]),
             ),
             (
                 "convolution in time",
                 video(TAPS[2]),
                 |x| convolved(x, ops::convolve, TAPS[2]),
-                |x| convolved(x, composed::convolve, TAPS[2]),
+                |x| convolved(x, unfused::convolve, TAPS[2]),
             ),
             (
                 "convolution in time with a stride",
                 video(TAPS[3]),
                 |x| convolved(x, ops::convolve, TAPS[3]),
-                |x| convolved(x, composed::convolve, TAPS[3]),
+                |x| convolved(x, unfused::convolve, TAPS[3]),
             ),
             (
                 "frame norm",
@@ -361,7 +361,7 @@ mod tests {
                     wave([1, 20], 2.0),
                 ],
                 |x| ops::frame_norm(x[0].clone(), flat(&x[1]), flat(&x[2]), 2, false),
-                |x| composed::frame_norm(x[0].clone(), flat(&x[1]), flat(&x[2]), 2, false),
+                |x| unfused::frame_norm(x[0].clone(), flat(&x[1]), flat(&x[2]), 2, false),
             ),
             (
                 "frame norm with SiLU",
@@ -371,7 +371,7 @@ mod tests {
                     wave([1, 20], 2.0),
                 ],
                 |x| ops::frame_norm(x[0].clone(), flat(&x[1]), flat(&x[2]), 2, true),
-                |x| composed::frame_norm(x[0].clone(), flat(&x[1]), flat(&x[2]), 2, true),
+                |x| unfused::frame_norm(x[0].clone(), flat(&x[1]), flat(&x[2]), 2, true),
             ),
         ]
     }
@@ -392,37 +392,37 @@ mod tests {
                     wave([1, 33], 2.0),
                 ],
                 |x| ops::linear(x[0].clone(), x[1].clone(), Some(flat(&x[2]))),
-                |x| composed::linear(x[0].clone(), x[1].clone(), Some(flat(&x[2]))),
+                |x| unfused::linear(x[0].clone(), x[1].clone(), Some(flat(&x[2]))),
             ),
             (
                 "linear without bias",
                 vec![wave([5, 19], 0.0), wave([33, 19], 1.0)],
                 |x| ops::linear(x[0].clone(), x[1].clone(), None),
-                |x| composed::linear(x[0].clone(), x[1].clone(), None),
+                |x| unfused::linear(x[0].clone(), x[1].clone(), None),
             ),
             (
                 "layer norm",
                 vec![wave([150, 37], 0.0), wave([1, 37], 1.0), wave([1, 37], 2.0)],
                 |x| ops::layer_norm(x[0].clone(), flat(&x[1]), Some(flat(&x[2])), 1e-6),
-                |x| composed::layer_norm(x[0].clone(), flat(&x[1]), Some(flat(&x[2])), 1e-6),
+                |x| unfused::layer_norm(x[0].clone(), flat(&x[1]), Some(flat(&x[2])), 1e-6),
             ),
             (
                 "layer norm without bias",
                 vec![wave([3, 48], 0.0), wave([1, 48], 1.0)],
                 |x| ops::layer_norm(x[0].clone(), flat(&x[1]), None, 1e-6),
-                |x| composed::layer_norm(x[0].clone(), flat(&x[1]), None, 1e-6),
+                |x| unfused::layer_norm(x[0].clone(), flat(&x[1]), None, 1e-6),
             ),
             (
                 "attention over ragged segments",
                 vec![wave([305, 36], 0.0)],
                 |x| ops::self_attention(x[0].clone(), 3, &Segments::within(&[290, 4, 11])),
-                |x| composed::self_attention(x[0].clone(), 3, &Segments::within(&[290, 4, 11])),
+                |x| unfused::self_attention(x[0].clone(), 3, &Segments::within(&[290, 4, 11])),
             ),
             (
                 "attention over a batch",
                 vec![wave([60, 24], 0.0)],
                 |x| ops::self_attention(x[0].clone(), 2, &Segments::batch(3, 20)),
-                |x| composed::self_attention(x[0].clone(), 2, &Segments::batch(3, 20)),
+                |x| unfused::self_attention(x[0].clone(), 2, &Segments::batch(3, 20)),
             ),
             (
                 "attention over several tiles of queries and keys",
@@ -433,14 +433,14 @@ mod tests {
                 },
                 |x| {
                     let segments = Segments::across(&[140], &[1700]);
-                    composed::cross_attention(x[0].clone(), x[1].clone(), 2, &segments)
+                    unfused::cross_attention(x[0].clone(), x[1].clone(), 2, &segments)
                 },
             ),
             (
                 "cross-attention with gaps and shared keys",
                 vec![wave([173, 8], 0.0), wave([70, 16], 0.5)],
                 |x| ops::cross_attention(x[0].clone(), x[1].clone(), 2, &ragged()),
-                |x| composed::cross_attention(x[0].clone(), x[1].clone(), 2, &ragged()),
+                |x| unfused::cross_attention(x[0].clone(), x[1].clone(), 2, &ragged()),
             ),
             (
                 "gelu",
@@ -458,7 +458,7 @@ mod tests {
                 "cross-entropy",
                 vec![wave([37, 101], 0.0) * 5.0],
                 |x| row(ops::cross_entropy(x[0].clone(), &targets(37, 101))),
-                |x| row(composed::cross_entropy(x[0].clone(), &targets(37, 101))),
+                |x| row(unfused::cross_entropy(x[0].clone(), &targets(37, 101))),
             ),
             (
                 "tied cross-entropy",
@@ -471,8 +471,8 @@ mod tests {
                     ))
                 },
                 |x| {
-                    let logits = composed::linear(x[0].clone(), x[1].clone(), None);
-                    row(composed::cross_entropy(logits, &targets(37, 101)))
+                    let logits = unfused::linear(x[0].clone(), x[1].clone(), None);
+                    row(unfused::cross_entropy(logits, &targets(37, 101)))
                 },
             ),
         ]
@@ -480,9 +480,9 @@ mod tests {
 
     #[test]
     fn every_kernel_and_its_gradients_agree_with_the_composed_operation() {
-        for (name, inputs, fused, composed) in cases() {
+        for (name, inputs, fused, unfused) in cases() {
             println!("{name}");
-            assert_close(&results(&inputs, &fused), &results(&inputs, &composed));
+            assert_close(&results(&inputs, &fused), &results(&inputs, &unfused));
         }
     }
 

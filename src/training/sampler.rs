@@ -10,7 +10,7 @@ use rand::RngExt;
 
 /// The order of clips of one or more data sets.
 #[derive(Debug, Clone)]
-pub struct Order {
+pub struct Sampler {
     seed: u64,
     lengths: Vec<u64>,
     /// Cumulative shares; the last is 1.
@@ -19,14 +19,14 @@ pub struct Order {
 
 /// A clip of a data set.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Place {
+pub struct SampleIndex {
     /// The data set.
     pub set: usize,
     /// The clip in it.
     pub clip: usize,
 }
 
-impl Order {
+impl Sampler {
     /// An order over data sets of `lengths` clips, drawn in proportion to `weights`; without weights, in proportion to their
     /// lengths.
     ///
@@ -66,7 +66,7 @@ impl Order {
 
     /// The clip at position `n` of the stream.
     #[must_use]
-    pub fn place(&self, n: u64) -> Place {
+    pub fn place(&self, n: u64) -> SampleIndex {
         let set = if self.lengths.len() == 1 {
             0
         } else {
@@ -79,7 +79,7 @@ impl Order {
         };
         let length = self.lengths[set];
         let epoch = Permutation::new(self.seed, set as u64, n / length, length);
-        Place {
+        SampleIndex {
             set,
             clip: epoch.at(n % length) as usize,
         }
@@ -141,7 +141,7 @@ mod tests {
     #[test]
     fn every_epoch_shows_every_clip_once_in_another_order() {
         for length in [1, 2, 3, 7, 64, 200, 1000] {
-            let order = Order::new(5, &["a"], &[length], None).unwrap();
+            let order = Sampler::new(5, &["a"], &[length], None).unwrap();
             let epoch = |e: usize| -> Vec<usize> {
                 (0..length)
                     .map(|i| order.place((e * length + i) as u64).clip)
@@ -157,7 +157,7 @@ mod tests {
     #[test]
     fn data_sets_come_in_proportion_to_their_weights() {
         let order =
-            Order::new(1, &["a", "b", "c"], &[10, 500, 90], Some(&[1.0, 2.0, 1.0])).unwrap();
+            Sampler::new(1, &["a", "b", "c"], &[10, 500, 90], Some(&[1.0, 2.0, 1.0])).unwrap();
         let mut counts = [0_usize; 3];
         for n in 0..8000 {
             let place = order.place(n);
@@ -173,11 +173,11 @@ mod tests {
     #[test]
     fn empty_data_sets_and_unusable_weights_are_refused() {
         assert_eq!(
-            Order::new(0, &["a", "b"], &[3, 0], None).unwrap_err(),
+            Sampler::new(0, &["a", "b"], &[3, 0], None).unwrap_err(),
             DataError::Empty("b".into())
         );
         for weights in [&[1.0][..], &[0.0, 0.0], &[-1.0, 2.0], &[f64::NAN, 1.0]] {
-            assert!(Order::new(0, &["a", "b"], &[3, 3], Some(weights)).is_err());
+            assert!(Sampler::new(0, &["a", "b"], &[3, 3], Some(weights)).is_err());
         }
     }
 }

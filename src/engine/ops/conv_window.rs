@@ -2,7 +2,7 @@
 
 /// Which input rows an output row is computed from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Taps {
+pub enum ConvWindow {
     /// 3 x 3 within each frame. Stride 1: zeros around the frame. Stride 2: zeros to the right and below only.
     Space {
         frames: usize,
@@ -19,7 +19,7 @@ pub enum Taps {
     },
 }
 
-impl Taps {
+impl ConvWindow {
     /// How many input rows make one output row.
     #[must_use]
     pub fn count(self) -> usize {
@@ -201,7 +201,7 @@ mod tests {
 
     #[test]
     fn convolutions_in_time_see_no_future() {
-        let taps = Taps::Time {
+        let taps = ConvWindow::Time {
             samples: 1,
             frames: 4,
             pixels: 1,
@@ -216,13 +216,13 @@ mod tests {
 
     #[test]
     fn units_cover_all_rows_and_share_none() {
-        let time = |stride| Taps::Time {
+        let time = |stride| ConvWindow::Time {
             samples: 2,
             frames: 6,
             pixels: 300,
             stride,
         };
-        let space = |stride| Taps::Space {
+        let space = |stride| ConvWindow::Space {
             frames: 3,
             height: 4,
             width: 6,

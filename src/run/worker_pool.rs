@@ -6,13 +6,13 @@
 use super::cache::Key;
 use super::environment;
 use super::error::RunError;
-use super::schedule::Work;
+use super::schedule::Task;
 use std::collections::BTreeMap;
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 
 /// What the stages of one process may take of the machine together.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Crew {
+pub struct WorkerPool {
     /// Stages at once, at most.
     pub jobs: usize,
     /// Threads of all stages together.
@@ -36,7 +36,7 @@ const MOST: usize = 4;
 /// Stacks of threads are as large as the main thread's.
 const STACK: usize = 8 << 20;
 
-impl Crew {
+impl WorkerPool {
     /// `jobs` stages at once on this machine, in half of its memory. By default as many as there are cores, up to four; one
     /// where a GPU may do the work.
     #[must_use]
@@ -64,11 +64,11 @@ impl Crew {
     /// out. After an error that `ends` everything the stages that run come to their end, and no other begins.
     pub fn work(
         &self,
-        works: &[&Work],
-        make: impl Fn(usize, &Work) -> Result<(), RunError> + Sync,
+        works: &[&Task],
+        make: impl Fn(usize, &Task) -> Result<(), RunError> + Sync,
         ends: impl Fn(&RunError) -> bool + Sync,
     ) -> Ended {
-        let board = Board::new(self, works);
+        let board = Scheduler::new(self, works);
         std::thread::scope(|scope| {
             for _ in 1..self.jobs.min(works.len()) {
                 let thread = std::thread::Builder::new().stack_size(STACK);
@@ -82,7 +82,7 @@ impl Crew {
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Standing {
+enum Status {
     Waiting,
     Running,
     Done,
@@ -91,9 +91,9 @@ enum Standing {
 }
 
 /// Who does what.
-struct Board<'a> {
-    crew: &'a Crew,
-    works: &'a [&'a Work],
+struct Scheduler<'a> {
+    crew: &'a WorkerPool,
+    works: &'a [&'a Task],
     /// Places of the works that each one reads.
     inputs: Vec<Vec<usize>>,
     state: Mutex<State>,
@@ -101,13 +101,13 @@ struct Board<'a> {
 }
 
 struct State {
-    standing: Vec<Standing>,
+    standing: Vec<Status>,
     failures: BTreeMap<usize, RunError>,
     end: Option<RunError>,
 }
 
-impl<'a> Board<'a> {
-    fn new(crew: &'a Crew, works: &'a [&'a Work]) -> Self {
+impl<'a> Scheduler<'a> {
+    fn new(crew: &'a WorkerPool, works: &'a [&'a Task]) -> Self {
         let places: BTreeMap<Key, usize> =
             works.iter().enumerate().map(|(i, w)| (w.key, i)).collect();
         Self {
@@ -122,7 +122,7 @@ impl<'a> Board<'a> {
                 })
                 .collect(),
             state: Mutex::new(State {
-                standing: vec![Standing::Waiting; works.len()],
+                standing: vec![Status::Waiting; works.len()],
                 failures: BTreeMap::new(),
                 end: None,
             }),
@@ -137,7 +137,7 @@ impl<'a> Board<'a> {
     /// Takes one work after the other until nothing is left to take.
     fn serve(
         &self,
-        make: &(impl Fn(usize, &Work) -> Result<(), RunError> + Sync),
+        make: &(impl Fn(usize, &Task) -> Result<(), RunError> + Sync),
         ends: &(impl Fn(&RunError) -> bool + Sync),
     ) {
         while let Some((place, threads)) = self.next() {
@@ -153,14 +153,14 @@ impl<'a> Board<'a> {
             };
             let mut state = self.lock();
             state.standing[place] = match made {
-                Ok(()) => Standing::Done,
+                Ok(()) => Status::Done,
                 Err(error) => {
                     if ends(&error) {
                         state.end.get_or_insert(error);
                     } else {
                         state.failures.insert(place, error);
                     }
-                    Standing::Failed
+                    Status::Failed
                 }
             };
             self.changed.notify_all();
@@ -178,13 +178,13 @@ impl<'a> Board<'a> {
             let running = state
                 .standing
                 .iter()
-                .filter(|one| **one == Standing::Running)
+                .filter(|one| **one == Status::Running)
                 .count();
             if let Some(&place) = ready
                 .iter()
                 .find(|place| self.fits(&state.standing, **place))
             {
-                state.standing[place] = Standing::Running;
+                state.standing[place] = Status::Running;
                 let beside = (running + ready.len()).min(self.crew.jobs);
                 return Some((place, (self.crew.threads / beside).max(1)));
             }
@@ -199,22 +199,19 @@ impl<'a> Board<'a> {
     }
 
     /// What waits and has all its inputs; marks what never will.
-    fn ready(&self, standing: &mut [Standing]) -> Vec<usize> {
+    fn ready(&self, standing: &mut [Status]) -> Vec<usize> {
         let mut ready = Vec::new();
         for place in 0..standing.len() {
-            if standing[place] != Standing::Waiting {
+            if standing[place] != Status::Waiting {
                 continue;
             }
             let inputs = &self.inputs[place];
             if inputs
                 .iter()
-                .any(|&input| standing[input] == Standing::Failed)
+                .any(|&input| standing[input] == Status::Failed)
             {
-                standing[place] = Standing::Failed;
-            } else if inputs
-                .iter()
-                .all(|&input| standing[input] == Standing::Done)
-            {
+                standing[place] = Status::Failed;
+            } else if inputs.iter().all(|&input| standing[input] == Status::Done) {
                 ready.push(place);
             }
         }
@@ -222,10 +219,10 @@ impl<'a> Board<'a> {
     }
 
     /// Whether there is memory for it beside what runs.
-    fn fits(&self, standing: &[Standing], place: usize) -> bool {
-        let planned = |work: &Work| work.plan["memory"].as_u64().unwrap_or(0);
+    fn fits(&self, standing: &[Status], place: usize) -> bool {
+        let planned = |work: &Task| work.plan["memory"].as_u64().unwrap_or(0);
         let others: Vec<u64> = (0..standing.len())
-            .filter(|&other| standing[other] == Standing::Running)
+            .filter(|&other| standing[other] == Status::Running)
             .map(|other| planned(self.works[other]))
             .collect();
         let together = others
@@ -257,8 +254,8 @@ mod tests {
         blake3::hash(name.as_bytes()).into()
     }
 
-    fn work(name: &str, inputs: &[&str], memory: u64) -> Work {
-        Work {
+    fn work(name: &str, inputs: &[&str], memory: u64) -> Task {
+        Task {
             key: key(name),
             stage: name.to_owned(),
             directory: name.to_owned(),
@@ -282,8 +279,8 @@ mod tests {
         }
     }
 
-    fn crew(jobs: usize) -> Crew {
-        Crew {
+    fn crew(jobs: usize) -> WorkerPool {
+        WorkerPool {
             jobs,
             threads: 4,
             memory: Some(100),
@@ -306,10 +303,10 @@ mod tests {
             work("reader", &["good", "bad"], 0),
             work("last", &["good"], 0),
         ];
-        let works: Vec<&Work> = works.iter().collect();
+        let works: Vec<&Task> = works.iter().collect();
         for jobs in [1, 3] {
             let order = Mutex::new(Vec::new());
-            let make = |_: usize, work: &Work| {
+            let make = |_: usize, work: &Task| {
                 order.lock().unwrap().push(work.stage.clone());
                 if work.stage == "bad" {
                     Err(failed())
@@ -334,9 +331,9 @@ mod tests {
             work("larger", &[], 90),
             work("small", &[], 10),
         ];
-        let works: Vec<&Work> = works.iter().collect();
+        let works: Vec<&Task> = works.iter().collect();
         let (now, most) = (AtomicUsize::new(0), AtomicUsize::new(0));
-        let make = |_: usize, work: &Work| {
+        let make = |_: usize, work: &Task| {
             let planned = work.plan["memory"].as_u64().unwrap() as usize;
             most.fetch_max(now.fetch_add(planned, SeqCst) + planned, SeqCst);
             std::thread::sleep(std::time::Duration::from_millis(20));
@@ -355,9 +352,9 @@ mod tests {
             work("second", &[], 0),
             work("third", &[], 0),
         ];
-        let works: Vec<&Work> = works.iter().collect();
+        let works: Vec<&Task> = works.iter().collect();
         let begun = AtomicUsize::new(0);
-        let make = |_: usize, _: &Work| {
+        let make = |_: usize, _: &Task| {
             begun.fetch_add(1, SeqCst);
             Err(failed())
         };

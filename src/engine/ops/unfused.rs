@@ -1,9 +1,9 @@
-//! Every operation composed of the tensor library's own: what runs on GPU back ends, and what fused ones are tested against.
+//! Every operation unfused of the tensor library's own: what runs on GPU back ends, and what fused ones are tested against.
 
 use burn::tensor::{Tensor, activation};
 
 use super::super::Segments;
-use super::{AdamWStep, FRAME_NORM_EPSILON, Taps, indices};
+use super::{AdamWStep, ConvWindow, FRAME_NORM_EPSILON, indices};
 
 pub fn linear(x: Tensor<2>, weight: Tensor<2>, bias: Option<Tensor<1>>) -> Tensor<2> {
     let y = x.matmul(weight.transpose());
@@ -101,7 +101,7 @@ pub fn cross_entropy(logits: Tensor<2>, targets: &[u32]) -> Tensor<1> {
         .neg()
 }
 
-pub fn convolve(x: Tensor<2>, weight: Tensor<2>, bias: Tensor<1>, taps: Taps) -> Tensor<2> {
+pub fn convolve(x: Tensor<2>, weight: Tensor<2>, bias: Tensor<1>, taps: ConvWindow) -> Tensor<2> {
     let ([rows, channels], outputs) = (x.dims(), weight.dims()[0]);
     // A tap beside the picture reads the row of zeros behind the last.
     let sources: Vec<u32> = (0..taps.rows_out())

@@ -9,14 +9,14 @@ use std::path::{Path, PathBuf};
 /// What [`FILE`] holds.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Binding {
+pub struct ModelManifest {
     /// The sizes of the clips the model was trained on.
     pub clips: ClipFormat,
     /// blake3 of the files of every tokenizer, by modality.
     pub tokenizers: BTreeMap<String, String>,
 }
 
-impl Binding {
+impl ModelManifest {
     /// Binds the tokenizers that lie in `folder` to the clips that their model was trained on.
     ///
     /// # Errors
@@ -26,7 +26,7 @@ impl Binding {
         Ok(Self { clips, tokenizers })
     }
 
-    /// What [`Binding::tokenizers`] says of the tokenizers that lie in `folder`; nothing where there are none.
+    /// What [`ModelManifest::tokenizers`] says of the tokenizers that lie in `folder`; nothing where there are none.
     ///
     /// # Errors
     /// When a file cannot be read.

@@ -1,13 +1,13 @@
 //! Gradients with the activations of one block at a time: of every block its input is kept, and backward computes the block
 //! once more. More arithmetic, and memory that hardly grows with depth.
 
-use super::batch::{Batch, Visible};
+use super::batch::{Batch, EncoderInput};
 use super::loss::{Loss, LossValues};
 use super::model::{Mget, decoder_segments};
 use crate::engine::{Gradients, Parameters, Segments, Tensor};
 
 impl Mget {
-    /// The losses of a batch, and the gradients of `share` times their total; `None` when nothing is asked or the total is not
+    /// The losses of a batch, and the gradients of `share` times their total; `None` when nothing is targets or the total is not
     /// finite. Equal to [`Mget::losses`] and [`Gradients::of`] up to rounding.
     #[must_use]
     pub fn recomputed(
@@ -19,8 +19,10 @@ impl Mget {
         let frozen = self.frozen();
         let encoder = frozen.encoder_inputs(&batch.visible);
         let context_ND = encoder.last().map(|h_ND| {
-            let place_ND = frozen.encoder_embeddings.place(&batch.visible.sequence);
-            frozen.context(frozen.encoder_norm.forward(h_ND.clone()), place_ND)
+            let positional_ND = frozen
+                .encoder_embeddings
+                .positional_embedding(&batch.visible.sequence);
+            frozen.context(frozen.encoder_norm.forward(h_ND.clone()), positional_ND)
         });
         let decoder = frozen.decoder_inputs(context_ND.as_ref(), batch);
         drop(frozen);
@@ -44,8 +46,8 @@ impl Mget {
         let [mut dy_MD] = gradients.add(&(total * share), self, [&y_MD]);
         drop(y_MD);
 
-        let asked = &batch.targets.sequence;
-        let (own_modality, visible) = decoder_segments(&batch.visible.sequence.lengths, asked);
+        let targets = &batch.targets.sequence;
+        let (own_modality, visible) = decoder_segments(&batch.visible.sequence.lengths, targets);
         let mut dcontext_ND: Option<Tensor<2>> = None;
         for (block, input_MD) in self.decoder.iter().zip(&decoder).rev() {
             let y_MD = leaf(input_MD);
@@ -63,11 +65,13 @@ impl Mget {
                 [dy_MD] = gradients.add(&slope, self, [&y_MD]);
             }
         }
-        let [] = gradients.add(&(self.questions(asked) * dy_MD).sum(), self, []);
+        let [] = gradients.add(&(self.decoder_queries(targets) * dy_MD).sum(), self, []);
 
         if let (Some(dcontext_ND), Some(h_ND)) = (dcontext_ND, encoder.last().map(leaf)) {
-            let place_ND = self.encoder_embeddings.place(&batch.visible.sequence);
-            let context_ND = self.context(self.encoder_norm.forward(h_ND.clone()), place_ND);
+            let positional_ND = self
+                .encoder_embeddings
+                .positional_embedding(&batch.visible.sequence);
+            let context_ND = self.context(self.encoder_norm.forward(h_ND.clone()), positional_ND);
             let [mut dh_ND] = gradients.add(&(context_ND * dcontext_ND).sum(), self, [&h_ND]);
             let samples = Segments::within(&batch.visible.sequence.lengths);
             for (block, input_ND) in self.encoder.iter().zip(&encoder).rev() {
@@ -76,8 +80,10 @@ impl Mget {
                 [dh_ND] = gradients.add(&(out_ND * dh_ND).sum(), self, [&h_ND]);
             }
             // Anew: backward has consumed the graph of the first.
-            let place_ND = self.encoder_embeddings.place(&batch.visible.sequence);
-            let input_ND = self.seen(&batch.visible, place_ND);
+            let positional_ND = self
+                .encoder_embeddings
+                .positional_embedding(&batch.visible.sequence);
+            let input_ND = self.input_embedding(&batch.visible, positional_ND);
             let [] = gradients.add(&(input_ND * dh_ND).sum(), self, []);
         }
         gradients.complete(self);
@@ -85,27 +91,29 @@ impl Mget {
     }
 
     /// The input of every block of the encoder, and the output of the last; nothing when nothing is visible.
-    fn encoder_inputs(&self, visible: &Visible) -> Vec<Tensor<2>> {
+    fn encoder_inputs(&self, visible: &EncoderInput) -> Vec<Tensor<2>> {
         if visible.sequence.is_empty() {
             return Vec::new();
         }
         let samples = Segments::within(&visible.sequence.lengths);
-        let place_ND = self.encoder_embeddings.place(&visible.sequence);
-        let mut inputs = vec![self.seen(visible, place_ND)];
+        let positional_ND = self
+            .encoder_embeddings
+            .positional_embedding(&visible.sequence);
+        let mut inputs = vec![self.input_embedding(visible, positional_ND)];
         for (place, block) in self.encoder.iter().enumerate() {
             inputs.push(block.forward(inputs[place].clone(), &samples));
         }
         inputs
     }
 
-    /// The input of every block of the decoder, and the output of the last; nothing when nothing is asked.
+    /// The input of every block of the decoder, and the output of the last; nothing when nothing is targets.
     fn decoder_inputs(&self, context_ND: Option<&Tensor<2>>, batch: &Batch) -> Vec<Tensor<2>> {
-        let asked = &batch.targets.sequence;
-        if asked.is_empty() {
+        let targets = &batch.targets.sequence;
+        if targets.is_empty() {
             return Vec::new();
         }
-        let (own_modality, visible) = decoder_segments(&batch.visible.sequence.lengths, asked);
-        let mut inputs = vec![self.questions(asked)];
+        let (own_modality, visible) = decoder_segments(&batch.visible.sequence.lengths, targets);
+        let mut inputs = vec![self.decoder_queries(targets)];
         for (place, block) in self.decoder.iter().enumerate() {
             let y_MD = inputs[place].clone();
             inputs.push(block.forward(y_MD, context_ND, &own_modality, &visible));
@@ -114,7 +122,7 @@ impl Mget {
     }
 }
 
-/// A value whose gradient is asked for.
+/// A value whose gradient is targets for.
 fn leaf(value: &Tensor<2>) -> Tensor<2> {
     value.clone().autodiff().require_grad()
 }

@@ -12,7 +12,7 @@ use super::table::{Cell, Row};
 use std::collections::BTreeMap;
 
 /// A score set seen on the common clips.
-pub(super) struct On<'a> {
+pub(super) struct AlignedScores<'a> {
     set: &'a ScoreSet,
     /// Position of every common clip in the set.
     order: Vec<usize>,
@@ -20,7 +20,7 @@ pub(super) struct On<'a> {
     is_larger: bool,
 }
 
-impl<'a> On<'a> {
+impl<'a> AlignedScores<'a> {
     pub(super) fn of(scores: &Scores, set: &'a ScoreSet, common: &[String]) -> Self {
         let position: BTreeMap<&String, usize> = scores
             .clips
@@ -42,11 +42,11 @@ impl<'a> On<'a> {
 }
 
 /// One row's score sets, one per seed.
-pub(super) struct Side<'a> {
-    pub(super) sets: Vec<On<'a>>,
+pub(super) struct RowScores<'a> {
+    pub(super) sets: Vec<AlignedScores<'a>>,
 }
 
-impl Side<'_> {
+impl RowScores<'_> {
     pub(super) fn cell(&self, column: &Column, settings: &IntervalSettings) -> Cell {
         if column.is_per_set() {
             return self.set_cell(column, settings);
@@ -132,7 +132,7 @@ fn wider(a: Option<Interval>, b: Option<Interval>) -> Option<Interval> {
 /// Paired differences of every row against row `reference`, Holm-corrected over the rows of each column.
 pub(super) fn add_differences(
     rows: &mut [Row],
-    sides: &[Side],
+    sides: &[RowScores],
     reference: usize,
     columns: &[Column],
     settings: &IntervalSettings,
@@ -141,7 +141,7 @@ pub(super) fn add_differences(
         if column.is_per_set() {
             continue;
         }
-        let means = |side: &Side| {
+        let means = |side: &RowScores| {
             let per_seed: Vec<_> = side
                 .sets
                 .iter()
