@@ -155,11 +155,11 @@ fn decode(folder: &Path) {
     let start = Instant::now();
     let model = Reconstructor::open(folder, &Compute::cpu()).unwrap();
     println!("opened in {:.1} s", start.elapsed().as_secs_f64());
-    let given = ["rgb".to_owned()];
-    let wanted = ["body", "camera", "gaze", "left_hand", "right_hand"].map(str::to_owned);
+    let inputs = ["rgb".to_owned()];
+    let targets = ["body", "camera", "gaze", "left_hand", "right_hand"].map(str::to_owned);
     let wish = GenerationRequest {
-        given: &given,
-        wanted: &wanted,
+        inputs: &inputs,
+        targets: &targets,
         decoding: &fast(),
         seed: 0,
     };

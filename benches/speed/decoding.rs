@@ -30,8 +30,8 @@ pub fn run(meter: &Meter, entry: &str) {
         .iter()
         .zip(mget::ids(&spec, 0))
         .map(|(modality, ids)| match modality.name.as_str() {
-            "rgb" => Slot::given(ids),
-            _ => Slot::unknown(modality.count()),
+            "rgb" => Slot::input(ids),
+            _ => Slot::masked(modality.count()),
         })
         .collect();
     let clip = [Sample { id: 0, slots }];

@@ -7,7 +7,7 @@ use reviv::decoding::filter::{Filter, Sampling, TopK, kept_tokens};
 use reviv::decoding::generate::{Checks, StepTrace, generate_checked};
 use reviv::decoding::plan::plan;
 use reviv::decoding::schedule::{TemperatureSchedule, TokenSchedule, cosine, linear};
-use reviv::decoding::settings::{Sampler, Scheme, TargetChanges};
+use reviv::decoding::settings::{Order, Scheme, TargetChanges};
 use reviv::decoding::{DecodingSettings, MgetTokens, Sample, Slot, TokenModality};
 use reviv::engine::{Compute, Parameters, Weights};
 use reviv::mget::names::modality_from_release;
@@ -94,12 +94,12 @@ fn schedules(all: &Value, report: &mut Report) {
     }
 }
 
-/// Sampler, counts, temperatures, guidance and hidden modalities of several targets.
+/// Order, counts, temperatures, guidance and hidden modalities of several targets.
 fn chained(index: usize, case: &Value, report: &mut Report) {
     let args = &case["args"];
     let (conditions, targets) = (names(&args["cond_domains"]), names(&args["target_domains"]));
     let mut settings = DecodingSettings {
-        order: Sampler::Chained,
+        order: Order::Chained,
         hide: Some(conditions.clone()),
         grow: args["cfg_grow_conditioning"].as_bool().unwrap_or(false),
         ..DecodingSettings::default()
@@ -318,7 +318,7 @@ fn generation(folder: &Path, stem: &str, report: &mut Report) -> Outcome {
 
     let number = |key: &str| settings[key].as_f64().unwrap_or(0.0);
     let mut decoding = DecodingSettings {
-        order: Sampler::Chained,
+        order: Order::Chained,
         hide: Some(names(&settings["cfg_hidden_at_start"])),
         grow: settings["cfg_grow_conditioning"].as_bool().unwrap_or(false),
         ..DecodingSettings::default()

@@ -84,7 +84,7 @@ impl Cut {
         }
     }
 
-    fn open(&self, path: &Path, settings: &CutSettings) -> Result<Arc<dyn Source>, Failure> {
+    fn open(&self, path: &Path, settings: &CutSettings) -> Result<Arc<dyn ClipSource>, Failure> {
         settings.check().map_err(failure)?;
         open(path, self.kind, settings, &[]).map_err(failure)
     }

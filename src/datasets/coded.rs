@@ -7,13 +7,13 @@ use std::sync::Arc;
 
 /// The clips of a source, each with what `format` leaves to code.
 pub struct Coded {
-    source: Arc<dyn Source>,
+    source: Arc<dyn ClipSource>,
     format: ClipFormat,
 }
 
 impl Coded {
     /// `source` itself where nothing is left to code.
-    pub fn wrap(source: Arc<dyn Source>, format: &ClipFormat) -> Arc<dyn Source> {
+    pub fn wrap(source: Arc<dyn ClipSource>, format: &ClipFormat) -> Arc<dyn ClipSource> {
         let needed = format.declared.iter().any(|d| d.source.code.is_some());
         if !needed {
             return source;

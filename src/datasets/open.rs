@@ -79,7 +79,7 @@ pub fn open(
     kind: Option<Dataset>,
     settings: &CutSettings,
     declared: &[DeclaredSettings],
-) -> Result<Arc<dyn Source>, ReadError> {
+) -> Result<Arc<dyn ClipSource>, ReadError> {
     let Some(kind) = kind else {
         for kind in Dataset::ALL {
             match open(path, Some(kind), settings, declared) {

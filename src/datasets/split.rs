@@ -138,13 +138,13 @@ pub fn divide(
 
 /// Some clips of a source.
 pub struct Chosen {
-    source: Arc<dyn Source>,
+    source: Arc<dyn ClipSource>,
     indices: Vec<usize>,
 }
 
 impl Chosen {
     /// The clips `indices` of `source`, in this order.
-    pub fn new(source: Arc<dyn Source>, indices: Vec<usize>) -> Self {
+    pub fn new(source: Arc<dyn ClipSource>, indices: Vec<usize>) -> Self {
         Chosen { source, indices }
     }
 }

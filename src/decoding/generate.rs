@@ -249,7 +249,7 @@ mod tests {
             rows: Range<usize>,
         ) -> Result<Vec<f32>, DecodingError> {
             let vocabulary = self.modalities[m].vocabulary.unwrap();
-            let all: Vec<(u64, u32)> = answers
+            let all: Vec<(u64, u32)> = decoder_output
                 .0
                 .iter()
                 .zip(&decoder_output.1)

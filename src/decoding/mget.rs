@@ -32,7 +32,7 @@ impl<'m> MgetTokens<'m> {
 
 /// The decoder's output and which rows are whose.
 #[derive(Debug, Clone)]
-pub struct MgetAnswers {
+pub struct MgetOutput {
     /// `None` when nothing was target_positions.
     y_MD: Option<Tensor<2>>,
     target_positions: Sequence,
@@ -40,7 +40,7 @@ pub struct MgetAnswers {
 
 impl TokenModel for MgetTokens<'_> {
     type Context = Context;
-    type DecoderOutput = MgetAnswers;
+    type DecoderOutput = MgetOutput;
 
     fn modalities(&self) -> &[TokenModality] {
         &self.modalities
@@ -91,7 +91,7 @@ impl TokenModel for MgetTokens<'_> {
         &self,
         context: &Context,
         target_positions: &TargetPositions,
-    ) -> Result<MgetAnswers, DecodingError> {
+    ) -> Result<MgetOutput, DecodingError> {
         for (m, modality) in self.modalities.iter().enumerate() {
             let outside = target_positions
                 .iter()
@@ -107,7 +107,7 @@ impl TokenModel for MgetTokens<'_> {
             target_positions.iter().map(Vec::as_slice),
         );
         let y_MD = self.model.decode(context, &target_positions);
-        Ok(MgetAnswers {
+        Ok(MgetOutput {
             y_MD,
             target_positions,
         })
@@ -115,16 +115,16 @@ impl TokenModel for MgetTokens<'_> {
 
     fn logits(
         &self,
-        decoder_output: &MgetAnswers,
+        decoder_output: &MgetOutput,
         modality: usize,
         rows: Range<usize>,
     ) -> Result<Vec<f32>, DecodingError> {
         let missing = || {
             DecodingError::Model(format!(
-                "rows {rows:?} of modality {modality} were not target_positions"
+                "rows {rows:?} of modality {modality} were not among the targets"
             ))
         };
-        let own = answers
+        let own = decoder_output
             .target_positions
             .rows
             .get(modality)

@@ -333,7 +333,7 @@ impl Reconstructor {
         inputs: &'a [String],
     ) -> Result<Conditioning<'a>, ReconstructorError> {
         let mut conditioning = Conditioning::default();
-        for name in given {
+        for name in inputs {
             let takes_pixels = self.model.spec().index(PIXELS).is_some();
             if takes_pixels && (name == PIXELS || name == "rgb") {
                 let rgb = self

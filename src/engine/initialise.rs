@@ -88,7 +88,7 @@ impl<'a> Initialise<'a> {
         values: impl FnOnce(usize) -> Vec<f32>,
     ) -> Parameter {
         if self.values == Fill::Nothing {
-            return Parameter::planned(kind, shape);
+            return Parameter::meta(kind, shape);
         }
         let values = values(shape.iter().product());
         Parameter::new(kind, values, shape, self.compute.device())

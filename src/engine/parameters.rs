@@ -17,7 +17,7 @@ pub enum Kind {
     /// Gradients are kept for it while the model trains.
     Trainable,
     /// Stored and loaded with the model, never changed by an optimizer.
-    Fixed,
+    Buffer,
 }
 
 /// One array of a model.

@@ -113,7 +113,7 @@ pub fn compare(
             sets: entrant
                 .seeds
                 .iter()
-                .map(|s| On::of(s, &s.own, &common))
+                .map(|s| AlignedScores::of(s, &s.own, &common))
                 .collect(),
         })
         .collect();
@@ -136,7 +136,7 @@ pub fn compare(
         let trivial = first.seeds[0].baselines.iter();
         for (name, set) in trivial.filter(|(name, _)| *name != FLOOR) {
             let side = RowScores {
-                sets: vec![On::of(&first.seeds[0], set, &common)],
+                sets: vec![AlignedScores::of(&first.seeds[0], set, &common)],
             };
             let row = Row {
                 label: name.clone(),
@@ -174,8 +174,14 @@ fn floors<'a>(
 ) -> Vec<Row> {
     let mut found: Vec<(Vec<&'a str>, Vec<Cell>)> = Vec::new();
     for entrant in entrants {
-        let of = |scores: &'a Scores| Some(On::of(scores, scores.baselines.get(FLOOR)?, common));
-        let sets: Vec<On> = entrant.seeds.iter().filter_map(of).collect();
+        let of = |scores: &'a Scores| {
+            Some(AlignedScores::of(
+                scores,
+                scores.baselines.get(FLOOR)?,
+                common,
+            ))
+        };
+        let sets: Vec<AlignedScores> = entrant.seeds.iter().filter_map(of).collect();
         let side = RowScores { sets };
         let cells: Vec<Cell> = columns.iter().map(|c| side.cell(c, settings)).collect();
         if cells.iter().all(|cell| cell.value.is_none()) {

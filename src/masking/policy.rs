@@ -85,7 +85,7 @@ impl Masking {
         self.budgets_of(component, present, rng)
     }
 
-    /// Token counts of one sample under a given mixture component.
+    /// Token counts of one sample under one mixture component.
     pub(super) fn budgets_of(
         &self,
         component: usize,
@@ -149,9 +149,9 @@ impl Masking {
     fn positions(&self, budgets: &Budgets, rng: &mut StreamRng) -> Mask {
         let mut mask = Mask::default();
         for (index, slot) in self.slots.iter().enumerate() {
-            let (inputs, asked) = (budgets.input[index], budgets.target[index]);
-            let mut chosen = choose(slot.tokens, given + asked, rng);
-            let mut target = chosen.split_off(given);
+            let (input, asked) = (budgets.input[index], budgets.target[index]);
+            let mut chosen = choose(slot.tokens, input + asked, rng);
+            let mut target = chosen.split_off(input);
             chosen.sort_unstable();
             target.sort_unstable();
             mask.input.push(chosen);
@@ -329,7 +329,7 @@ mod tests {
                     );
                     assert!(inputs.is_disjoint(&asked));
                     assert!(
-                        given
+                        inputs
                             .iter()
                             .chain(&asked)
                             .all(|p| (**p as usize) < slot.tokens)

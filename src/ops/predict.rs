@@ -83,7 +83,7 @@ impl PredictSettings {
     /// The modalities to generate, of those the model knows.
     fn targets<'a>(&self, known: impl Iterator<Item = &'a str>) -> Vec<String> {
         known
-            .filter(|name| *name != PIXELS && !self.inputs.iter().any(|given| inputs == name))
+            .filter(|name| *name != PIXELS && !self.inputs.iter().any(|input| input == name))
             .filter(|name| self.targets.is_empty() || self.targets.iter().any(|w| w == name))
             .map(ToOwned::to_owned)
             .collect()

@@ -333,7 +333,7 @@ fn tokens(entry: &TokenizerEntry, shape: &Shape) -> Result<TokenFacts, String> {
 /// How many trainable numbers the tokenizer has; nothing is allocated.
 fn parameters(entry: &TokenizerEntry, shape: &Shape) -> Option<u64> {
     let compute = Compute::cpu();
-    let planned = Initialise::planned(&compute);
+    let planned = Initialise::meta(&compute);
     let count = match entry {
         TokenizerEntry::Vq(settings) => VqVae::new(&planned, settings, shape).ok()?.count(),
         TokenizerEntry::Video(settings) => Network::new(&planned, settings).ok()?.count(),

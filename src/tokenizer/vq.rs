@@ -428,13 +428,13 @@ mod tests {
             channels,
         };
         let sizes = VqSettings::default();
-        assert_eq!(planned(&sizes, &temporal(9)).count(), 179_635_250);
-        assert_eq!(planned(&sizes, &temporal(2)).count(), 179_613_732);
+        assert_eq!(meta(&sizes, &temporal(9)).count(), 179_635_250);
+        assert_eq!(meta(&sizes, &temporal(2)).count(), 179_613_732);
         let joints = VqSettings {
             compression: vec![2, 3],
             ..sizes
         };
-        let body = planned(
+        let body = meta(
             &joints,
             &Shape::Kinematic {
                 samples: 60,

@@ -8,7 +8,7 @@ use reviv::geometry::rigid::Rigid;
 use reviv::geometry::rigid::level_camera;
 use reviv::geometry::skeleton::{BODY, JOINTS};
 use reviv::reconstruction::cloud::ray;
-use reviv::reconstruction::folder::{Folder, Setting, first_camera};
+use reviv::reconstruction::folder::{Folder, ReconstructionInfo, first_camera};
 use reviv::reconstruction::predictions::ScaleStatus;
 use reviv::reconstruction::scale::FloorFit;
 use reviv::reconstruction::stitch::gravity_to_world;
@@ -100,8 +100,8 @@ fn decoded(start: usize, wrong: [f64; 2]) -> Clip {
     clip
 }
 
-fn setting(seconds: f64) -> Setting {
-    Setting {
+fn setting(seconds: f64) -> ReconstructionInfo {
+    ReconstructionInfo {
         title: "walk".into(),
         video_rate: 8.0,
         frames: (seconds * 8.0).ceil() as usize,
@@ -118,7 +118,7 @@ fn setting(seconds: f64) -> Setting {
 
 fn build(
     seconds: f64,
-    setting: Setting,
+    setting: ReconstructionInfo,
     path: &std::path::Path,
 ) -> reviv::reconstruction::folder::Manifest {
     let mut folder = Folder::new(path, setting).unwrap();
@@ -206,7 +206,7 @@ fn an_anchor_depth_makes_it_metric_and_its_absence_of_floor_does_not() {
     let directory = tempfile::tempdir().unwrap();
     let truth = decoded(0, [1.0, 0.0]).depth.unwrap().metres;
     let anchor = Array3::from_shape_fn((16, 32, 32), |(f, y, x)| truth[[f, y, x]]);
-    let anchored = Setting {
+    let anchored = ReconstructionInfo {
         anchor: Some(anchor.clone()),
         ..setting(2.0)
     };
@@ -219,7 +219,7 @@ fn an_anchor_depth_makes_it_metric_and_its_absence_of_floor_does_not() {
     );
     assert!((manifest.fit.unwrap().scale - 2.0).abs() < 1e-3);
 
-    let unknown = Setting {
+    let unknown = ReconstructionInfo {
         anchor: Some(anchor.mapv(|_| f32::NAN)),
         ..setting(2.0)
     };

@@ -7,7 +7,7 @@ use reviv::mget::{Mget, MgetSpec, ModalitySpec, Positions, Size};
 use reviv::random::stream;
 use reviv::tokenizer::TokenGrid;
 use reviv::training::{
-    BatchSource, DataError, DatasetSize, InMemory, Loader, Order, TokenSample, TokenSource,
+    BatchSource, DataError, DatasetSize, InMemory, Loader, Sampler, TokenSample, TokenSource,
     Trainer, TrainingError, TrainingSettings, Unigram, Validation,
 };
 use std::ops::Range;
@@ -109,7 +109,7 @@ impl Setup {
         Arc::new(BatchSource {
             spec: spec(),
             masking: Self::masking(),
-            order: Order::new(3, &["counting"], &[self.source.len()], None).unwrap(),
+            order: Sampler::new(3, &["counting"], &[self.source.len()], None).unwrap(),
             sources: vec![Arc::clone(&self.source)],
             seed: 3,
             micro_batches: self.settings.micro_batches(),

@@ -3,7 +3,7 @@
 use super::super::run::{interruptible, progress};
 use super::super::terminal::{Failure, Terminal};
 use super::{Cut, failure, source_entry};
-use crate::datasets::Source;
+use crate::datasets::ClipSource;
 use crate::datasets::survey::{Survey, survey};
 use crate::formats::png;
 use crate::modality::inventory::Row;
@@ -85,7 +85,7 @@ impl Inspect {
         Ok(())
     }
 
-    fn source(&self, terminal: &Terminal) -> Result<Arc<dyn Source>, Failure> {
+    fn source(&self, terminal: &Terminal) -> Result<Arc<dyn ClipSource>, Failure> {
         if self.path.exists() {
             let mut settings = self.cut.settings();
             let source = self.cut.open(&self.path, &settings)?;

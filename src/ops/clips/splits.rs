@@ -14,7 +14,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 /// A split and its clips.
-pub(super) type Part = (&'static str, Arc<dyn Source>);
+pub(super) type Part = (&'static str, Arc<dyn ClipSource>);
 
 /// The clips of each split, in the order they are stored.
 pub(super) fn parts(
@@ -27,7 +27,7 @@ pub(super) fn parts(
         let world = World::new(from.world.clone(), context.seed());
         let part = |(split, first, count): (&'static str, u64, u64)| {
             let clips = WorldClips::new(world.clone(), first..first + count);
-            let source: Arc<dyn Source> = Arc::new(clips.with_declared(&format.declared));
+            let source: Arc<dyn ClipSource> = Arc::new(clips.with_declared(&format.declared));
             (split, Coded::wrap(source, format))
         };
         return Ok(settings.splits().map(part).collect());

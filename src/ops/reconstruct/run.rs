@@ -79,7 +79,7 @@ pub(super) fn run(
     let recording = Recording::open(settings, clips.as_ref(), &format)?;
     let list = windows(recording.seconds, settings.overlap)
         .map_err(|error| input(error, "choose another `overlap`"))?;
-    let has = |name: &str| targets.iter().any(|wanted| targets == name);
+    let has = |name: &str| targets.iter().any(|target| target == name);
     if list.len() > 1 && has("body") && !has("camera") {
         return Err(input(
             "`body` over several windows needs the camera path, which says where each window starts",
