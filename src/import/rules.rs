@@ -1,7 +1,7 @@
 //! What may happen to an entry of a released checkpoint. Nothing is dropped before it has been shown to be redundant.
 
-use super::pickle::Scalar;
 use super::{Checkpoint, ImportError};
+use crate::formats::pickle::Scalar;
 use crate::nn::positions::{self, GridOrder};
 use serde_json::Value;
 

@@ -1,7 +1,7 @@
 //! Which entries share memory, and whether they may.
 
 use super::Entry;
-use crate::import::pickle::{Scalar, TensorView};
+use crate::formats::pickle::{Scalar, TensorView};
 use std::collections::{BTreeMap, BTreeSet};
 
 /// More tensors than any model has.
@@ -76,7 +76,7 @@ pub(super) fn identify(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::import::pickle::Storage;
+    use crate::formats::pickle::Storage;
 
     /// A line of elements in one storage of 64 bytes.
     fn line(name: &str, scalar: Scalar, offset: u64, length: u64) -> (String, TensorView) {

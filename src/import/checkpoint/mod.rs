@@ -9,7 +9,7 @@ mod stream;
 mod torch;
 
 use super::ImportError;
-use super::pickle::{Scalar, TensorView};
+use crate::formats::pickle::{Scalar, TensorView};
 use crate::formats::zip::ZipArchive;
 use serde_json::{Map, Value};
 use std::collections::BTreeSet;

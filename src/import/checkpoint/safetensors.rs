@@ -2,8 +2,8 @@
 
 use super::memory::identify;
 use super::{Checkpoint, Format, Source};
+use crate::formats::pickle::{Scalar, Storage, TensorView};
 use crate::import::ImportError;
-use crate::import::pickle::{Scalar, Storage, TensorView};
 use serde_json::{Map, Value};
 use std::collections::BTreeSet;
 use std::fs::File;

@@ -1,8 +1,8 @@
 //! Values of entries, in pieces.
 
 use super::{Checkpoint, Source};
+use crate::formats::pickle::{Scalar, TensorView};
 use crate::import::ImportError;
-use crate::import::pickle::{Scalar, TensorView};
 use std::io::{Read, Seek, SeekFrom};
 use std::path::Path;
 

@@ -2,9 +2,9 @@
 
 use super::memory::{MAX_ENTRIES, MAX_NAME, identify};
 use super::{Checkpoint, Format, Source};
+use crate::formats::pickle::{Id, Node, Pickle, TensorView};
 use crate::formats::zip::{Method, ZipArchive};
 use crate::import::ImportError;
-use crate::import::pickle::{Id, Node, Pickle, TensorView};
 use serde_json::{Map, Value};
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
