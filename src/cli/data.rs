@@ -7,7 +7,7 @@ mod synthesize;
 use super::run::{interruptible, progress};
 use super::terminal::{Failure, Terminal};
 use crate::datasets::convert::{ConvertSettings, Converted, convert};
-use crate::datasets::open::{Dataset, open};
+use crate::datasets::open::{Dataset, OpenWith, open};
 use crate::datasets::recording::CutSettings;
 use crate::datasets::shards::{Folder, Header};
 use crate::datasets::{ClipSource, ReadError};
@@ -86,7 +86,7 @@ impl Cut {
 
     fn open(&self, path: &Path, settings: &CutSettings) -> Result<Arc<dyn ClipSource>, Failure> {
         settings.check().map_err(failure)?;
-        open(path, self.kind, settings, &[]).map_err(failure)
+        open(path, self.kind, settings, OpenWith::default()).map_err(failure)
     }
 }
 
@@ -114,6 +114,25 @@ fn source_entry(name: &str) -> Result<SourceSettings, Failure> {
             format!("`reviv show source/{name}` shows its settings"),
         )
     })
+}
+
+/// What a source lacks, and which recordings it leaves out, one line each.
+fn remarks(source: &dyn ClipSource) -> String {
+    let recordings = source.recordings().len();
+    let mut lines = String::new();
+    for (note, count) in source.notes() {
+        let share = if count < recordings {
+            format!(" ({count} of {recordings} recordings)")
+        } else {
+            String::new()
+        };
+        lines.push_str(&format!("note: {note}{share}\n"));
+    }
+    for excluded in source.excluded() {
+        let name = &excluded.recording;
+        lines.push_str(&format!("excluded: `{name}`: {}\n", excluded.reason));
+    }
+    lines
 }
 
 /// The user's files are for the user to mend, the disk is not.
@@ -164,6 +183,7 @@ fn write(
         ControlFlow::Continue(())
     });
     drop(task);
+    terminal.note(remarks(source));
     let converted = converted.map_err(failure)?;
     if converted.interrupted {
         terminal.note("interrupted; give the same command again and it continues\n");

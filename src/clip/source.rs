@@ -34,11 +34,29 @@ pub trait ClipSource: Send + Sync {
         vec![(self.name().to_owned(), 0..self.len())]
     }
 
+    /// Recordings that are here and give no clips, each with the reason.
+    fn excluded(&self) -> Vec<Excluded> {
+        Vec::new()
+    }
+
+    /// What is absent and what to supply for it, one sentence each, with the number of recordings it holds for.
+    fn notes(&self) -> Vec<(String, usize)> {
+        Vec::new()
+    }
+
     /// Makes clip number `index`.
     ///
     /// # Errors
     /// When a file cannot be read or is malformed, or `index >= len()`.
     fn clip(&self, index: usize) -> Result<Outcome, ReadError>;
+}
+
+/// A recording that gives no clips.
+#[derive(Debug, Clone, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+pub struct Excluded {
+    pub recording: String,
+    /// One sentence that names the file.
+    pub reason: String,
 }
 
 /// What became of one clip.

@@ -1,25 +1,38 @@
-//! Many recordings as one [`Source`]: opened when needed, a few of them kept open.
+//! Many recordings as one [`ClipSource`]: opened when needed, a few of them kept open.
 
 use super::declared::DeclaredTrack;
 use super::recording::{CutSettings, Recording};
-use super::{ClipSource, Outcome, ReadError};
+use super::{ClipSource, Excluded, Outcome, ReadError};
 use crate::modality::{BUILT_IN, ClipFormat, DeclaredSettings};
+use rayon::prelude::*;
+use std::collections::BTreeMap;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, OnceLock};
 
-/// Opens one recording of a data set.
-pub type Open = fn(&Path, &CutSettings) -> Result<Recording, ReadError>;
+/// Opens one recording of a data set, by the folder or file that stands for it.
+pub type Open = dyn Fn(&Path, &CutSettings) -> Result<Recording, ReadError> + Send + Sync;
 
 /// An open recording with its declared signals, or room for one.
 type Slot = Arc<OnceLock<Arc<(Recording, Vec<DeclaredTrack>)>>>;
+
+/// What is kept of a recording that was opened to be counted.
+struct Counted {
+    name: String,
+    clips: usize,
+    modalities: Vec<String>,
+    notes: Vec<String>,
+}
 
 /// Recordings of one data set.
 pub struct Recordings {
     name: String,
     settings: CutSettings,
-    open: Open,
+    open: Box<Open>,
     folders: Vec<PathBuf>,
+    excluded: Vec<Excluded>,
+    /// What recordings lack, with the number of those that lack it.
+    notes: BTreeMap<String, usize>,
     /// First clip of every recording, and the number of all clips at the end.
     starts: Vec<usize>,
     names: Vec<String>,
@@ -42,36 +55,76 @@ impl std::fmt::Debug for Recordings {
 }
 
 impl Recordings {
-    /// Opens every folder once to count its clips.
+    /// Opens every recording once to count its clips. One that cannot be opened is excluded, with its reason, where there are
+    /// others.
     ///
     /// # Errors
-    /// When settings make no sense, or a recording cannot be opened.
+    /// When settings make no sense, or not one recording can be opened.
     pub fn new(
         name: &str,
         folders: Vec<PathBuf>,
         settings: CutSettings,
-        open: Open,
+        open: impl Fn(&Path, &CutSettings) -> Result<Recording, ReadError> + Send + Sync + 'static,
     ) -> Result<Self, ReadError> {
         settings.check()?;
+        // Recordings hold open files and tables: only what is counted is kept.
+        let counted: Vec<Result<Counted, ReadError>> = folders
+            .par_iter()
+            .map(|folder| {
+                let recording = open(folder, &settings)?;
+                recording.check(&settings)?;
+                Ok(Counted {
+                    clips: recording.clips(&settings),
+                    modalities: recording.modalities(),
+                    name: recording.id,
+                    notes: recording.notes,
+                })
+            })
+            .collect();
         let mut starts = vec![0];
         let (mut modalities, mut names): (Vec<String>, Vec<String>) = Default::default();
-        for folder in &folders {
-            let recording = open(folder, &settings)?;
-            recording.check(&settings)?;
-            starts.push(starts[starts.len() - 1] + recording.clips(&settings));
-            names.push(recording.id.clone());
-            for modality in recording.modalities() {
+        let (mut opened, mut excluded, mut notes) = (Vec::new(), Vec::new(), BTreeMap::new());
+        let mut first_error = None;
+        for (folder, counted) in folders.into_iter().zip(counted) {
+            let counted = match counted {
+                Ok(counted) => counted,
+                // What the user asked for is wrong for every recording.
+                Err(error @ ReadError::Settings(_)) => return Err(error),
+                Err(error) => {
+                    excluded.push(Excluded {
+                        recording: folder.file_name().map_or_else(
+                            || folder.display().to_string(),
+                            |name| name.to_string_lossy().into_owned(),
+                        ),
+                        reason: error.to_string(),
+                    });
+                    first_error = first_error.or(Some(error));
+                    continue;
+                }
+            };
+            opened.push(folder);
+            starts.push(starts[starts.len() - 1] + counted.clips);
+            names.push(counted.name);
+            for note in counted.notes {
+                *notes.entry(note).or_default() += 1;
+            }
+            for modality in counted.modalities {
                 if !modalities.contains(&modality) {
                     modalities.push(modality);
                 }
             }
         }
+        if let (true, Some(error)) = (opened.is_empty(), first_error) {
+            return Err(error);
+        }
         modalities.sort_by_key(|name| BUILT_IN.iter().position(|known| known == name));
         Ok(Recordings {
             name: name.to_owned(),
             settings,
-            open,
-            folders,
+            open: Box::new(open),
+            folders: opened,
+            excluded,
+            notes,
             starts,
             names,
             modalities,
@@ -147,6 +200,15 @@ impl ClipSource for Recordings {
     fn recordings(&self) -> Vec<(String, Range<usize>)> {
         let ranges = self.starts.windows(2).map(|pair| pair[0]..pair[1]);
         self.names.iter().cloned().zip(ranges).collect()
+    }
+
+    fn excluded(&self) -> Vec<Excluded> {
+        self.excluded.clone()
+    }
+
+    fn notes(&self) -> Vec<(String, usize)> {
+        let notes = self.notes.iter();
+        notes.map(|(note, count)| (note.clone(), *count)).collect()
     }
 
     fn clip(&self, index: usize) -> Result<Outcome, ReadError> {

@@ -33,5 +33,5 @@ pub mod survey;
 pub mod track;
 pub mod umetrack;
 
-pub use crate::clip::source::{ClipSource, Clips, DropReason, Outcome, clips};
+pub use crate::clip::source::{ClipSource, Clips, DropReason, Excluded, Outcome, clips};
 pub use crate::formats::ReadError;

@@ -69,8 +69,16 @@ impl Dataset {
     }
 }
 
-/// Opens `path` as this kind of data set; without a kind, as the first kind that finds its recordings there. Recordings that have
-/// folders of their own bring `declared` modalities with them.
+/// What a data set is opened with besides its own files.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct OpenWith<'a> {
+    /// Modalities that recordings with folders of their own bring along.
+    pub declared: &'a [DeclaredSettings],
+    /// The folder of the user's `MANO_LEFT.pkl` and `MANO_RIGHT.pkl`, for sets whose hands are MANO parameters.
+    pub mano: Option<&'a Path>,
+}
+
+/// Opens `path` as this kind of data set; without a kind, as the first kind that finds its recordings there.
 ///
 /// # Errors
 /// [`ReadError::Absent`] when nothing is found; another when what is found cannot be opened.
@@ -78,11 +86,11 @@ pub fn open(
     path: &Path,
     kind: Option<Dataset>,
     settings: &CutSettings,
-    declared: &[DeclaredSettings],
+    with: OpenWith<'_>,
 ) -> Result<Arc<dyn ClipSource>, ReadError> {
     let Some(kind) = kind else {
         for kind in Dataset::ALL {
-            match open(path, Some(kind), settings, declared) {
+            match open(path, Some(kind), settings, with) {
                 // Nothing of this kind is there: try the next.
                 Err(ReadError::Absent { .. }) => {}
                 other => return other,
@@ -96,7 +104,7 @@ pub fn open(
             ),
         ));
     };
-    let settings = settings.clone();
+    let (settings, declared) = (settings.clone(), with.declared);
     // A file is a video, whatever is asked.
     if path.is_file() && kind != Dataset::Video {
         return Err(ReadError::absent(

@@ -114,6 +114,8 @@ pub struct Recording {
     pub hands_frame: JointFrame,
     /// In the world.
     pub body: Option<Track<Joints>>,
+    /// What this recording lacks and what to supply for it, one sentence each.
+    pub notes: Vec<String>,
     /// The undistortion map, made once.
     pub remap: OnceLock<Arc<Remap>>,
 }
@@ -180,6 +182,7 @@ impl Recording {
             hands: [None, None],
             hands_frame: JointFrame::World,
             body: None,
+            notes: Vec::new(),
             remap: OnceLock::new(),
         }
     }

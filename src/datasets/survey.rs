@@ -2,7 +2,7 @@
 
 use super::convert::Tally;
 use super::pipeline::in_order;
-use super::{ClipSource, Outcome, ReadError};
+use super::{ClipSource, Excluded, Outcome, ReadError};
 use crate::clip::Clip;
 use crate::modality::ClipFormat;
 use crate::modality::inventory::{Inventory, count};
@@ -17,6 +17,10 @@ pub struct Survey {
     pub clips: usize,
     pub looked_at: usize,
     pub recordings: usize,
+    /// Recordings that give no clips, with the reason.
+    pub excluded: Vec<Excluded>,
+    /// What is absent and what to supply for it, with the number of recordings that lack it.
+    pub notes: Vec<(String, usize)>,
     pub format: ClipFormat,
     pub tally: Tally,
     pub inventory: Inventory,
@@ -52,6 +56,8 @@ pub fn survey(
         clips,
         looked_at: 0,
         recordings: source.recordings().len(),
+        excluded: source.excluded(),
+        notes: source.notes(),
         inventory: Inventory::of(&format),
         format: format.clone(),
         tally: Tally::default(),

@@ -6,6 +6,7 @@ use proptest::prelude::*;
 use reviv::datasets::aria::vrs::image::{Pictures, Pixels};
 use reviv::datasets::aria::vrs::{Kind, StreamId, Vrs};
 use reviv::datasets::aria::{gaze, hand_tracking, trajectory};
+use reviv::datasets::open::OpenWith;
 use reviv::datasets::recording::CutSettings;
 use reviv::datasets::umetrack::HandProfile;
 use reviv::datasets::{ClipSource, Outcome, ReadError, adt, egom2p, neutral};
@@ -415,7 +416,12 @@ fn a_lens_that_is_unknown_or_of_another_size_a_slanted_turn_and_empty_depth_are_
 
 #[test]
 fn a_recording_that_lacks_a_part_is_an_error_and_not_another_kind() {
-    let look = |folder: &Path| match reviv::datasets::open::open(folder, None, &small(), &[]) {
+    let look = |folder: &Path| match reviv::datasets::open::open(
+        folder,
+        None,
+        &small(),
+        OpenWith::default(),
+    ) {
         Ok(source) => panic!("opened as `{}`", source.name()),
         Err(error) => error,
     };

@@ -2,7 +2,7 @@
 
 use super::super::run::{interruptible, progress};
 use super::super::terminal::{Failure, Terminal};
-use super::{Cut, failure, source_entry};
+use super::{Cut, failure, remarks, source_entry};
 use crate::datasets::ClipSource;
 use crate::datasets::survey::{Survey, survey};
 use crate::formats::png;
@@ -157,6 +157,7 @@ fn words(found: &Survey, source: &dyn ClipSource) -> String {
         f.signal_rate,
         source.modalities().join(" ")
     );
+    text.push_str(&remarks(source));
     for (reason, count) in &found.tally.dropped {
         let _ = writeln!(text, "dropped: {count}, {reason}");
     }

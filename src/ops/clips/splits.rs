@@ -2,7 +2,7 @@
 
 use super::settings::{ClipsSettings, MARKERS};
 use crate::datasets::coded::Coded;
-use crate::datasets::open::open;
+use crate::datasets::open::{OpenWith, open};
 use crate::datasets::split::{Chosen, divide};
 use crate::datasets::{ClipSource, ReadError};
 use crate::experiment::context::{StageContext, StageError};
@@ -37,7 +37,11 @@ pub(super) fn parts(
         message: format!("data set `{data}` is not configured"),
         help: "add it to `data.yaml`".to_owned(),
     })?;
-    let source = open(root, from.dataset, &from.cut, &format.declared).map_err(refused)?;
+    let with = OpenWith {
+        declared: &format.declared,
+        ..OpenWith::default()
+    };
+    let source = open(root, from.dataset, &from.cut, with).map_err(refused)?;
     if let Some(there) = source.format() {
         let size = |format: &ClipFormat| (format.frames, format.size, format.video_rate.to_bits());
         if size(&there) != size(format) {
