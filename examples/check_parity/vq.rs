@@ -75,7 +75,7 @@ fn build(file: &Vectors, compute: &Compute) -> Outcome<VqVae> {
         },
         ema_decay: number("decay")?,
         dead_below: number("dead_threshold")?,
-        commitment: number("commitment")?,
+        commitment_weight: number("commitment")?,
         ..VqSettings::default()
     };
     let mut model = VqVae::new(&Initialise::empty(compute), &settings, &shape)?;

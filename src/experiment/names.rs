@@ -14,6 +14,26 @@ pub fn nearest<'a>(wrong: &str, names: impl Iterator<Item = &'a str>) -> Option<
         .map(|(_, name)| name)
 }
 
+/// Keys that had another name before version 0.2, as (old, new). Where a place knows the new one, an old one's error says it.
+const RENAMED: &[(&str, &str)] = &[
+    ("given", "inputs"),
+    ("wanted", "targets"),
+    ("more_tokens", "tokens"),
+    ("recompute", "activation_checkpointing"),
+    ("rate", "learning_rate"),
+    ("velocity", "velocity_weight"),
+    ("commitment", "commitment_weight"),
+    ("floor", "reconstruction_bound"),
+];
+
+/// What `old` is called since it was renamed, where that is one of the `known` keys.
+pub fn renamed(old: &str, known: &[&str]) -> Option<&'static str> {
+    RENAMED
+        .iter()
+        .find(|(name, new)| *name == old && known.contains(new))
+        .map(|(_, new)| *new)
+}
+
 /// A sentence for a help line: the nearest name, or all of them where there are few.
 pub fn suggest(wrong: &str, names: &[&str]) -> Option<String> {
     if let Some(near) = nearest(wrong, names.iter().copied()) {
@@ -63,6 +83,12 @@ fn distance(a: &[char], b: &str) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn an_old_name_leads_to_the_new_one_where_that_is_known() {
+        assert_eq!(renamed("given", &["inputs", "model"]), Some("inputs"));
+        assert_eq!(renamed("given", &["steps"]), None);
+    }
 
     #[test]
     fn a_typing_slip_finds_its_name_and_a_different_word_does_not() {

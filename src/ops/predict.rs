@@ -43,7 +43,7 @@ pub struct PredictSettings {
     #[schemars(range(min = 1))]
     pub limit: Option<usize>,
     /// Also write the tokenizer floor, which `evaluate` shows beside every metric.
-    pub floor: bool,
+    pub reconstruction_bound: bool,
 }
 
 impl Default for PredictSettings {
@@ -57,7 +57,7 @@ impl Default for PredictSettings {
             },
             split: "test".to_owned(),
             limit: None,
-            floor: true,
+            reconstruction_bound: true,
         }
     }
 }
@@ -237,11 +237,11 @@ impl Op for Predict {
         };
         let mut writer = create(context.output(), "reviv")?;
         let mut floor = None;
-        if settings.floor {
+        if settings.reconstruction_bound {
             floor = Some(create(&context.output().join(FLOOR), "tokenizer floor")?);
         }
         let mut read: Vec<&str> = settings.inputs.iter().map(|name| signal_of(name)).collect();
-        if settings.floor {
+        if settings.reconstruction_bound {
             read.extend(targets.iter().map(String::as_str));
         }
         let mut times = Times::default();

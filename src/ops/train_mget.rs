@@ -49,7 +49,7 @@ pub struct TrainMgetSettings {
     pub tubelet: [usize; 3],
     /// Position tables of time-by-joints grids; `released` is needed only for imported weights.
     pub positions: Positions,
-    /// How often each data set is drawn, `tokens` first, then `more_tokens`; empty means in proportion to its clips.
+    /// How often each data set of `tokens` is drawn; empty means in proportion to its clips.
     pub weights: Vec<f64>,
     /// Share of the training clips of every data set that is used, the first ones.
     #[schemars(range(min = 0.0, max = 1.0))]
@@ -114,20 +114,12 @@ impl Op for TrainMget {
     }
 
     fn inputs(&self) -> &'static [Port] {
-        &[
-            Port {
-                name: "tokens",
-                kinds: &[ArtifactKind::Tokens],
-                arity: Arity::One,
-                about: "the token grids to train and validate on",
-            },
-            Port {
-                name: "more_tokens",
-                kinds: &[ArtifactKind::Tokens],
-                arity: Arity::Any,
-                about: "further data sets to train on, drawn by `weights`",
-            },
-        ]
+        &[Port {
+            name: "tokens",
+            kinds: &[ArtifactKind::Tokens],
+            arity: Arity::Many,
+            about: "the data sets' token grids: all are trained on, drawn by `weights`; the first is validated on",
+        }]
     }
 
     fn output(&self) -> ArtifactKind {
@@ -157,12 +149,12 @@ impl Op for TrainMget {
                 );
             }
         }
-        for facts in inputs.all("more_tokens") {
+        for facts in inputs.all("tokens").iter().skip(1) {
             for (name, own) in &facts.description.tokens {
                 if tokens.tokens.get(name).is_some_and(|first| first != own) {
                     problems.push(Problem::new(
                         Code::E0401,
-                        "more_tokens",
+                        "tokens",
                         format!(
                             "`{}` has other `{name}` tokens than the first data set",
                             facts.stage
@@ -171,7 +163,7 @@ impl Op for TrainMget {
                 }
             }
         }
-        let sets = 1 + inputs.all("more_tokens").len();
+        let sets = inputs.all("tokens").len();
         if !settings.weights.is_empty() && settings.weights.len() != sets {
             problems.push(Problem::new(
                 Code::E0206,
@@ -334,9 +326,9 @@ fn spec(
 
 /// The training clips that are used, of all data sets.
 fn training_clips(settings: &TrainMgetSettings, inputs: &Inputs<'_>) -> u64 {
-    ["tokens", "more_tokens"]
+    inputs
+        .all("tokens")
         .iter()
-        .flat_map(|port| inputs.all(port))
         .map(|facts| facts.description.clips.get("train").copied().unwrap_or(1))
         .map(|clips| settings.used(clips))
         .sum()
@@ -398,10 +390,7 @@ mod tests {
             kind: ArtifactKind::Tokens,
             description,
         };
-        let inputs = Inputs::new(vec![
-            ("tokens", vec![facts(&a)]),
-            ("more_tokens", vec![facts(&b), facts(&c)]),
-        ]);
+        let inputs = Inputs::new(vec![("tokens", vec![facts(&a), facts(&b), facts(&c)])]);
         let mut settings = TrainMgetSettings::default();
         assert_eq!(training_clips(&settings, &inputs), 136);
         settings.train_share = 0.5;

@@ -22,8 +22,8 @@ use crate::modality::Shape;
 use crate::tokenizer::video::Network;
 use crate::tokenizer::video::padding::Padding;
 use crate::tokenizer::vq::VqVae;
-use crate::training::AdamWSettings;
 use crate::training::tokenizer::TokenizerTraining;
+use crate::training::{AdamWSettings, Duration};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
@@ -43,9 +43,9 @@ pub struct TrainTokenizerSettings {
     #[schemars(range(min = 1))]
     pub batch: usize,
     /// Peak learning rate; it falls along half a cosine.
-    pub rate: f64,
-    /// Steps until the peak.
-    pub warmup: u64,
+    pub learning_rate: f64,
+    /// Linear rise from 0: `{steps: n}` or `{epochs: x}`.
+    pub warmup: Duration,
     /// The optimizer.
     pub optimizer: AdamWSettings,
     /// Before the first step, fit the scales of the new network to the first clips: latents become white, and a video
@@ -72,8 +72,8 @@ impl Default for TrainTokenizerSettings {
             tokenizer: None,
             steps: training.steps,
             batch: training.batch,
-            rate: training.rate,
-            warmup: training.warmup,
+            learning_rate: training.rate,
+            warmup: Duration::Steps(training.warmup),
             optimizer: training.optimizer,
             calibrate: true,
             mirror: true,
@@ -86,13 +86,25 @@ impl Default for TrainTokenizerSettings {
 }
 
 impl TrainTokenizerSettings {
-    fn training(&self) -> TokenizerTraining {
+    /// Training on `signals` signals.
+    fn training(&self, signals: u64) -> TokenizerTraining {
         TokenizerTraining {
             steps: self.steps,
             batch: self.batch,
-            rate: self.rate,
-            warmup: self.warmup,
+            rate: self.learning_rate,
+            warmup: self.warmup_steps(signals).unwrap_or_default(),
             optimizer: self.optimizer.clone(),
+        }
+    }
+
+    /// `None` where the warm-up is not measured in steps or epochs of signals.
+    fn warmup_steps(&self, signals: u64) -> Option<u64> {
+        match self.warmup {
+            Duration::Steps(steps) => Some(steps),
+            Duration::Epochs(epochs) if epochs.is_finite() && epochs >= 0.0 => {
+                Some((epochs * (signals / self.batch.max(1) as u64).max(1) as f64).ceil() as u64)
+            }
+            Duration::Epochs(_) | Duration::Tokens(_) => None,
         }
     }
 
@@ -173,16 +185,21 @@ impl Op for TrainTokenizer {
             ));
             return Description::default();
         };
-        if settings.warmup > settings.steps {
-            let message = format!(
-                "{} warm-up steps in a run of {}",
-                settings.warmup, settings.steps
-            );
-            problems.push(Problem::new(Code::E0206, "warmup", message));
+        let signals = clips.clips.get("train").copied().unwrap_or_default();
+        match settings.warmup_steps(signals) {
+            Some(warmup) if warmup > settings.steps => {
+                let message = format!("{warmup} warm-up steps in a run of {}", settings.steps);
+                problems.push(Problem::new(Code::E0206, "warmup", message));
+            }
+            Some(_) => {}
+            None => problems.push(
+                Problem::new(Code::E0206, "warmup", "a tokenizer has no such warm-up")
+                    .help("measure it in steps, `{steps: 50}`, or in passes, `{epochs: 5}`"),
+            ),
         }
-        if !(settings.rate.is_finite() && settings.rate > 0.0) {
-            let message = format!("a learning rate of {}", settings.rate);
-            problems.push(Problem::new(Code::E0202, "rate", message));
+        if !(settings.learning_rate.is_finite() && settings.learning_rate > 0.0) {
+            let message = format!("a learning rate of {}", settings.learning_rate);
+            problems.push(Problem::new(Code::E0202, "learning_rate", message));
         }
         if let Some(name) = settings.optimizer.wrong() {
             let place = format!("optimizer.{name}");

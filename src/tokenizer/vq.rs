@@ -320,10 +320,10 @@ impl VqVae {
             _ => square_NP,
         };
         let loss = self.total(square_NP, batch);
-        if self.settings.velocity == 0.0 {
+        if self.settings.velocity_weight == 0.0 {
             return loss;
         }
-        loss + self.velocity(error_NP, batch) * self.settings.velocity
+        loss + self.velocity(error_NP, batch) * self.settings.velocity_weight
     }
 
     /// The penalty of the errors of steps from each sample to the next; both have to be valid.
@@ -404,7 +404,7 @@ impl VqVae {
         Trained {
             reconstruction: scalar(&reconstruction),
             commitment: scalar(&commitment),
-            loss: reconstruction + commitment * self.settings.commitment,
+            loss: reconstruction + commitment * self.settings.commitment_weight,
             assignment,
         }
     }

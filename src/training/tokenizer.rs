@@ -185,7 +185,7 @@ impl Trainer {
             .map(|i| data[i].clone())
             .collect();
         let trained = self.model.forward_training(&batch(&self.model, &chosen));
-        let weight = self.model.settings().commitment;
+        let weight = self.model.settings().commitment_weight;
         let loss = trained.reconstruction + weight * trained.commitment;
         if !loss.is_finite() {
             let step = step + 1;

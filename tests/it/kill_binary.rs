@@ -23,7 +23,7 @@ stages:
     modality: gaze
     tokenizer: vq_temporal_small
     steps: 12
-    warmup: 2
+    warmup: {steps: 2}
     batch: 4
     checkpoint_every: 3
 ";
@@ -35,7 +35,7 @@ base: base.yaml
 seeds: [0, 1]
 arms:
   gaze: {stages.statistics.modalities: [gaze]}
-  fast: {stages.tok_gaze.rate: 0.01}
+  fast: {stages.tok_gaze.learning_rate: 0.01}
 ";
 
 fn begin(folder: &Path, runs: &Path) -> Child {

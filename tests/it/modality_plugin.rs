@@ -24,25 +24,25 @@ stages:
     validation: 2
     test: 4
     declared: [head_imu, head_turn]
-  tok_imu: {op: train_tokenizer, clips: clips, modality: head_imu, steps: 3, batch: 4, warmup: 0, kmeans: false}
+  tok_imu: {op: train_tokenizer, clips: clips, modality: head_imu, steps: 3, batch: 4, warmup: {steps: 0}, kmeans: false}
   tok_turn:
     op: train_tokenizer
     clips: clips
     modality: head_turn
     tokenizer: {use: vq_temporal_small, codebook: 16, width: 16, depth: 1, heads: 2}
     steps: 5
-    warmup: 0
+    warmup: {steps: 0}
   tok_camera:
     op: train_tokenizer
     clips: clips
     modality: camera
     tokenizer: {use: vq_temporal_small, codebook: 16, width: 16, depth: 1, heads: 2}
     steps: 3
-    warmup: 0
+    warmup: {steps: 0}
   tokens: {op: tokenize, clips: clips, tokenizers: [tok_imu, tok_turn, tok_camera]}
   mget:
     op: train_mget
-    tokens: tokens
+    tokens: [tokens]
     size: {use: laptop_small, width: 24, heads: 2, encoder_depth: 1, decoder_depth: 1}
     masking: {use: dirichlet_mixture, input_tokens: 30, target_tokens: 30}
     steps: 3

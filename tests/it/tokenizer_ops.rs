@@ -23,8 +23,8 @@ stages:
     modality: camera
     tokenizer: {use: vq_temporal_small, codebook: 16, width: 16, depth: 1, heads: 2}
     steps: 150
-    rate: 0.003
-    warmup: 5
+    learning_rate: 0.003
+    warmup: {steps: 5}
     checkpoint_every: 20
   tok_left_hand:
     op: train_tokenizer
@@ -33,7 +33,7 @@ stages:
     tokenizer: {use: vq_kinematic_small, codebook: 16, width: 16, depth: 1, heads: 2}
     steps: 4
     batch: 4
-    warmup: 0
+    warmup: {steps: 0}
   tok_rgb:
     op: train_tokenizer
     clips: clips
@@ -41,7 +41,7 @@ stages:
     tokenizer: {use: video_tiny, channels: 4}
     steps: 3
     batch: 2
-    warmup: 0
+    warmup: {steps: 0}
   tokens:
     op: tokenize
     clips: clips

@@ -164,7 +164,9 @@ impl<'c> Validator<'c, '_> {
             format!("unknown key `{}`", item.key),
         )
         .label("nothing reads this");
-        diagnostic = if known.is_empty() {
+        diagnostic = if let Some(new) = names::renamed(&item.key, &known) {
+            diagnostic.help(format!("it is called `{new}` now"))
+        } else if known.is_empty() {
             diagnostic.help("there are no settings here: remove it")
         } else {
             diagnostic.help(names::suggest(&item.key, &known).unwrap_or_default())

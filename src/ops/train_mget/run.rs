@@ -67,10 +67,7 @@ impl Run {
         context: &mut dyn StageContext,
     ) -> Result<Self, StageError> {
         let seed = context.seed();
-        let artifacts: Vec<InputArtifact> = ["tokens", "more_tokens"]
-            .iter()
-            .flat_map(|port| context.inputs(port).to_vec())
-            .collect();
+        let artifacts: Vec<InputArtifact> = context.inputs("tokens").to_vec();
         let first = artifacts
             .first()
             .ok_or_else(|| damaged("no tokens arrived"))?;

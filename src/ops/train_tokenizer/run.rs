@@ -137,8 +137,12 @@ fn train_vq(
         let batches: Vec<_> = first.chunks(16).map(|part| batch(&model, part)).collect();
         model.calibrate(&batches).map_err(StageError::other)?;
     }
-    let trainer = Trainer::new(model, &settings.training(), context.seed())
-        .map_err(|error| failed(error, settings))?;
+    let trainer = Trainer::new(
+        model,
+        &settings.training(prepared.len() as u64),
+        context.seed(),
+    )
+    .map_err(|error| failed(error, settings))?;
     let mut training = VqTraining {
         trainer,
         data: &prepared,
@@ -222,8 +226,12 @@ fn train_video(
         }
         model.calibrate(&first).map_err(StageError::other)?;
     }
-    let trainer = VideoTrainer::new(model, &settings.training(), context.seed())
-        .map_err(|error| failed(error, settings))?;
+    let trainer = VideoTrainer::new(
+        model,
+        &settings.training(having.len() as u64),
+        context.seed(),
+    )
+    .map_err(|error| failed(error, settings))?;
     let mut training = VideoTraining {
         trainer,
         data,
@@ -471,7 +479,7 @@ fn failed(error: TrainingError, settings: &TrainTokenizerSettings) -> StageError
             StageError::Input {
                 code: Code::E0206,
                 message: error.to_string(),
-                help: format!("try a `rate` below {}", settings.rate),
+                help: format!("try a `learning_rate` below {}", settings.learning_rate),
             }
         }
         TrainingError::NoData => StageError::Input {

@@ -42,13 +42,15 @@ pub struct VqSettings {
     pub loss: Loss,
     /// Weight of the errors of steps from sample to sample beside the errors of samples. Small tokenizers jump where a token ends;
     /// this smooths them. 0: none, as in the paper.
-    pub velocity: f64,
+    #[serde(alias = "velocity")]
+    pub velocity_weight: f64,
     /// Decay of the running means of codes and counts.
     pub ema_decay: f64,
     /// Codes with a smaller running count are replaced by latents of the batch.
     pub dead_below: f64,
     /// Weight of the loss that pulls latents to their codes.
-    pub commitment: f64,
+    #[serde(alias = "commitment")]
+    pub commitment_weight: f64,
     /// How the position table of a grid of joints is enumerated.
     pub positions: GridOrder,
 }
@@ -65,10 +67,10 @@ impl Default for VqSettings {
             heads: 12,
             mlp_ratio: 4,
             loss: Loss::MaskedMse,
-            velocity: 0.0,
+            velocity_weight: 0.0,
             ema_decay: 0.99,
             dead_below: 2.0,
-            commitment: 1.0,
+            commitment_weight: 1.0,
             positions: GridOrder::Released,
         }
     }
@@ -114,11 +116,11 @@ impl VqSettings {
         }
         if !(0.0..1.0).contains(&self.ema_decay)
             || self.dead_below < 0.0
-            || self.commitment < 0.0
-            || self.velocity < 0.0
+            || self.commitment_weight < 0.0
+            || self.velocity_weight < 0.0
         {
             return wrong(
-                "ema_decay lies in [0, 1), dead_below, commitment and velocity are not negative"
+                "ema_decay lies in [0, 1), dead_below, commitment_weight and velocity_weight are not negative"
                     .to_owned(),
             );
         }
@@ -131,7 +133,7 @@ impl VqSettings {
             code_width: self.code_width,
             decay: self.ema_decay,
             dead_below: self.dead_below,
-            commitment: self.commitment,
+            commitment: self.commitment_weight,
         }
     }
 }
