@@ -1,6 +1,6 @@
 //! A source whose declared modalities are computed by the code of plug-in crates.
 
-use super::{ClipSource, Outcome, ReadError};
+use super::{ClipSource, Excluded, Outcome, ReadError};
 use crate::modality::{ClipFormat, code};
 use std::ops::Range;
 use std::sync::Arc;
@@ -42,6 +42,14 @@ impl ClipSource for Coded {
 
     fn recordings(&self) -> Vec<(String, Range<usize>)> {
         self.source.recordings()
+    }
+
+    fn excluded(&self) -> Vec<Excluded> {
+        self.source.excluded()
+    }
+
+    fn notes(&self) -> Vec<(String, usize)> {
+        self.source.notes()
     }
 
     fn clip(&self, index: usize) -> Result<Outcome, ReadError> {

@@ -316,7 +316,11 @@ fn tick(k: usize) -> i64 {
 }
 
 /// A row of poses; `None` where it is missing: not finite, or never filled.
-fn pose(path: &Path, row: usize, m: ArrayView2<f64>) -> Result<Option<Rigid>, ReadError> {
+pub(super) fn pose(
+    path: &Path,
+    row: usize,
+    m: ArrayView2<f64>,
+) -> Result<Option<Rigid>, ReadError> {
     if m.iter().all(|v| *v == 0.0) {
         return Ok(None);
     }
@@ -356,7 +360,7 @@ fn hand(path: &Path) -> Result<Track<Joints>, ReadError> {
     Ok(Track::new(samples, SECOND / 10, SECOND / 60))
 }
 
-fn array(path: &Path) -> Result<NpyArray, ReadError> {
+pub(super) fn array(path: &Path) -> Result<NpyArray, ReadError> {
     if path.extension().is_some_and(|extension| extension == "npy") {
         return Ok(npy::read(path)?);
     }
@@ -372,7 +376,7 @@ fn array(path: &Path) -> Result<NpyArray, ReadError> {
         .ok_or_else(|| ReadError::missing(path, "there are several arrays, and none is `arr_0`"))
 }
 
-fn expect(path: &Path, found: &[usize], wanted: &[usize]) -> Result<(), ReadError> {
+pub(super) fn expect(path: &Path, found: &[usize], wanted: &[usize]) -> Result<(), ReadError> {
     if found == wanted {
         return Ok(());
     }

@@ -3,7 +3,7 @@
 use super::recording::{ColourFrames, CutSettings, Recording};
 use super::shards::ShardClips;
 use super::track::SECOND;
-use super::{ClipSource, Outcome, ReadError, adt, egom2p, hot3d, mps, neutral};
+use super::{ClipSource, Outcome, ReadError, adt, egogen, egom2p, holoassist, hot3d, mps, neutral};
 use crate::modality::{ClipFormat, DeclaredSettings};
 use crate::video::image::Image;
 use crate::video::{Video, folder};
@@ -22,6 +22,10 @@ pub enum Dataset {
     Hot3dAria,
     /// HOT3D recordings of Quest 3 headsets.
     Hot3dQuest,
+    /// HoloAssist sessions.
+    Holoassist,
+    /// EgoGen as EgoM2P stores it.
+    Egogen,
     /// Aria recordings with the files of Machine Perception Services.
     Aria,
     /// Clips in shards that were made before.
@@ -36,12 +40,14 @@ pub enum Dataset {
 
 impl Dataset {
     /// Every kind, in the order in which a path is tried.
-    pub const ALL: [Dataset; 8] = [
+    pub const ALL: [Dataset; 10] = [
         Dataset::Shards,
         Dataset::Neutral,
         Dataset::Adt,
         Dataset::Hot3dAria,
         Dataset::Hot3dQuest,
+        Dataset::Holoassist,
+        Dataset::Egogen,
         Dataset::Aria,
         Dataset::Egom2p,
         Dataset::Video,
@@ -54,6 +60,8 @@ impl Dataset {
             Dataset::Adt => "adt",
             Dataset::Hot3dAria => "hot3d_aria",
             Dataset::Hot3dQuest => "hot3d_quest",
+            Dataset::Holoassist => "holoassist",
+            Dataset::Egogen => "egogen",
             Dataset::Aria => "aria",
             Dataset::Shards => "shards",
             Dataset::Neutral => "neutral",
@@ -116,6 +124,10 @@ pub fn open(
         Dataset::Adt => Arc::new(adt::source(path, settings)?.with_declared(declared)),
         Dataset::Hot3dAria => Arc::new(hot3d::aria(path, settings)?.with_declared(declared)),
         Dataset::Hot3dQuest => Arc::new(hot3d::quest(path, settings)?.with_declared(declared)),
+        Dataset::Holoassist => {
+            Arc::new(holoassist::source(path, settings)?.with_declared(declared))
+        }
+        Dataset::Egogen => Arc::new(egogen::source(path, settings)?.with_declared(declared)),
         Dataset::Aria => Arc::new(mps::source(path, settings)?.with_declared(declared)),
         Dataset::Neutral => Arc::new(neutral::source(path, settings)?.with_declared(declared)),
         Dataset::Shards => Arc::new(ShardClips::open(path)?),

@@ -1,7 +1,7 @@
 //! Which recordings of a data set are for training, which for validation and which for the test: whole recordings, so that no two
 //! clips of one stretch of time stand on both sides.
 
-use super::{ClipSource, Outcome, ReadError};
+use super::{ClipSource, Excluded, Outcome, ReadError};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::ops::Range;
@@ -160,6 +160,14 @@ impl ClipSource for Chosen {
 
     fn modalities(&self) -> Vec<String> {
         self.source.modalities()
+    }
+
+    fn excluded(&self) -> Vec<Excluded> {
+        self.source.excluded()
+    }
+
+    fn notes(&self) -> Vec<(String, usize)> {
+        self.source.notes()
     }
 
     fn clip(&self, index: usize) -> Result<Outcome, ReadError> {

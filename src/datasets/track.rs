@@ -40,11 +40,19 @@ impl Blend for [f64; 2] {
 /// Joints, each of which may be missing.
 pub type Joints = [Option<Point3<f64>>; 21];
 
+/// Clocks are rounded: a sample this near, as a share of the way to the next, is the sample itself.
+const NEGLIGIBLE: f64 = 1e-4;
+
 impl Blend for Joints {
     fn blend(&self, other: &Self, weight: f64) -> Option<Self> {
         Some(std::array::from_fn(|joint| {
-            let (a, b) = (self[joint]?, other[joint]?);
-            Some(a + (b - a) * weight)
+            match (self[joint], other[joint]) {
+                (Some(a), Some(b)) => Some(a + (b - a) * weight),
+                // Only one of the two is known: it counts at its own time alone.
+                (a, _) if weight < NEGLIGIBLE => a,
+                (_, b) if weight > 1.0 - NEGLIGIBLE => b,
+                _ => None,
+            }
         }))
     }
 }
@@ -194,6 +202,15 @@ mod tests {
         assert_eq!(track.at(110 * MS), Some([2.0, 0.0]));
         assert_eq!(track.at(250 * MS), None);
         assert_eq!(track.at(400 * MS), Some([9.0, 0.0]));
+    }
+
+    #[test]
+    fn a_joint_counts_at_its_own_time_whatever_its_neighbours_lack() {
+        let joints = |there: bool| -> Joints { [there.then(Point3::origin); 21] };
+        let samples = vec![(0, joints(true)), (100, joints(false)), (200, joints(true))];
+        let track = Track::new(samples, 150, 20);
+        let known = [0, 50, 100, 150, 200].map(|time| track.at(time).unwrap()[3].is_some());
+        assert_eq!(known, [true, false, false, false, true]);
     }
 
     #[test]

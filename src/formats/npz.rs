@@ -1,7 +1,7 @@
 //! NumPy's npz: a zip archive of npy members, read as a map of named arrays.
 
 use super::npy::{self, NpyArray};
-use super::zip::{ZipArchive, ZipWriter, missing};
+use super::zip::{EntryReader, ZipArchive, ZipWriter, missing};
 use super::{FormatError, write_atomically};
 use std::collections::BTreeMap;
 use std::io::{Cursor, Read, Seek};
@@ -54,6 +54,34 @@ impl Npz {
             Self::collect(zip, |name| names.contains(&name))
         };
         read().map_err(|e: FormatError| e.in_file(path))
+    }
+
+    /// Reads the array `name` row by row, in memory that does not depend on how many there are.
+    pub fn rows<T>(
+        path: &Path,
+        name: &str,
+        read: impl FnOnce(&mut npy::Rows<EntryReader<'_>>) -> Result<T, FormatError>,
+    ) -> Result<T, FormatError> {
+        let rows = || {
+            let mut zip = ZipArchive::open(path)?;
+            let member = format!("{name}.npy");
+            let Some(entry) = zip.find(&member) else {
+                let entries = zip.entries().iter();
+                let present = entries.map(|e| e.name.trim_end_matches(".npy"));
+                return Err(missing(name, present));
+            };
+            let size = entry.size;
+            read(&mut npy::Rows::new(zip.reader(&member)?, size)?)
+        };
+        rows().map_err(|e| match e {
+            FormatError::Malformed {
+                format: "npy",
+                offset,
+                reason,
+            } => FormatError::malformed("npy", offset, format!("array `{name}`: {reason}"))
+                .in_file(path),
+            other => other.in_file(path),
+        })
     }
 
     /// Reads all arrays from the bytes of an npz file.
@@ -135,6 +163,40 @@ mod tests {
             error.contains("a.npz") && error.contains("pose, valid"),
             "{error}"
         );
+    }
+
+    #[test]
+    fn rows_are_those_of_the_whole_array() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.npz");
+        sample().write(&path).unwrap();
+        let all = |rows: &mut npy::Rows<EntryReader<'_>>| {
+            let shape = rows.shape().to_vec();
+            let mut found = Vec::new();
+            while let Some(row) = rows.next_row()? {
+                found.push(row.to_vec());
+            }
+            Ok((shape, found))
+        };
+        let (shape, found) = Npz::rows(&path, "pose", all).unwrap();
+        assert_eq!(
+            (shape, found),
+            (vec![2, 2], vec![vec![1.0, 2.0], vec![3.0, 4.0]])
+        );
+        let (_, found) = Npz::rows(&path, "valid", all).unwrap();
+        assert_eq!(found, [[1.0], [0.0]]);
+        let error = Npz::rows(&path, "gaze", all).unwrap_err().to_string();
+        assert!(error.contains("pose, valid"), "{error}");
+        // A flipped bit of a value is noticed at the end.
+        let mut bytes = std::fs::read(&path).unwrap();
+        let at = bytes
+            .windows(8)
+            .position(|w| w == 3.0f64.to_le_bytes())
+            .unwrap();
+        bytes[at + 2] ^= 1;
+        std::fs::write(&path, &bytes).unwrap();
+        let error = Npz::rows(&path, "pose", all).unwrap_err().to_string();
+        assert!(error.contains("checksum"), "{error}");
     }
 
     proptest! {

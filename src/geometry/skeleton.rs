@@ -136,6 +136,12 @@ pub const HAND_FROM_COMMON: [usize; JOINTS] = [
     0, 5, 6, 7, 9, 10, 11, 17, 18, 19, 13, 14, 15, 1, 2, 3, 4, 8, 12, 16, 20,
 ];
 
+/// Wrist, thumb, index, middle, ring, pinky among the 26 joints of HoloLens 2 (palm and wrist, then the thumb's four, then five of
+/// each finger with the metacarpal first).
+pub const COMMON_FROM_HOLOLENS: [usize; JOINTS] = [
+    1, 2, 3, 4, 5, 7, 8, 9, 10, 12, 13, 14, 15, 17, 18, 19, 20, 22, 23, 24, 25,
+];
+
 /// `ours[i] = smpl22[BODY_FROM_SMPL22[i]]`.
 pub const BODY_FROM_SMPL22: [usize; JOINTS] = [
     0, 1, 2, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21,

@@ -35,6 +35,7 @@ mod kill;
 mod kill_binary;
 mod language;
 mod language_ops;
+mod layouts;
 mod plugins;
 mod rules;
 mod run;

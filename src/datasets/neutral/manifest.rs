@@ -1,6 +1,6 @@
 //! What `recording.yaml` says, as it is written.
 
-use crate::geometry::skeleton::{BODY_FROM_SMPL22, HAND_FROM_COMMON};
+use crate::geometry::skeleton::{BODY_FROM_SMPL22, COMMON_FROM_HOLOLENS, HAND_FROM_COMMON};
 use nalgebra::{Matrix3, Vector3};
 use serde::Deserialize;
 use std::path::PathBuf;
@@ -216,10 +216,6 @@ pub(super) enum JointOrder {
 impl JointOrder {
     /// For each of our joints the one in this order.
     pub(super) fn map(self) -> ([usize; 21], usize) {
-        /// Wrist, thumb, index, middle, ring, pinky among HoloLens's joints.
-        const COMMON_FROM_HOLOLENS: [usize; 21] = [
-            1, 2, 3, 4, 5, 7, 8, 9, 10, 12, 13, 14, 15, 17, 18, 19, 20, 22, 23, 24, 25,
-        ];
         match self {
             JointOrder::Reviv => (std::array::from_fn(|k| k), 21),
             JointOrder::Common => (HAND_FROM_COMMON, 21),

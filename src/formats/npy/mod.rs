@@ -5,9 +5,11 @@
 
 mod element;
 mod header;
+mod rows;
 mod values;
 
 pub use element::{Dtype, Element, NpyData, Number};
+pub use rows::Rows;
 
 use super::FormatError;
 use element::with_data;
