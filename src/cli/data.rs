@@ -47,7 +47,8 @@ impl super::Run for Data {
 /// How clips are cut from recordings.
 #[derive(Debug, Clone, clap::Args)]
 struct Cut {
-    /// What lies there: adt, hot3d_aria, hot3d_quest, aria, neutral, egom2p, video or shards; else what it looks like
+    /// What lies there: adt, hot3d_aria, hot3d_quest, holoassist, egogen, aria, neutral, egom2p, video or shards; else what it
+    /// looks like
     #[arg(long, value_name = "KIND", value_parser = kind)]
     kind: Option<Dataset>,
     /// Frames per second of colour and depth
