@@ -6,7 +6,7 @@
 //! as BT.601 with limited range at every resolution, as they do.
 
 use crate::video::image::Image;
-use rusty_h264::YuvFrame;
+use rusty_h264_common::YuvFrame;
 
 /// How colours are coded.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]

@@ -7,7 +7,7 @@ use super::mp4::{Sample, Track};
 use crate::formats::ReadError;
 use crate::formats::read_error::Position;
 use crate::video::image::Turn;
-use rusty_h264::YuvFrame;
+use rusty_h264_common::YuvFrame;
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};

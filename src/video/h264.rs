@@ -2,7 +2,8 @@
 //! colours does it carry?), and the decoder itself behind a wall that turns whatever goes wrong in it into an error.
 
 use super::colour::{ColourSpace, Matrix};
-use rusty_h264::{DecodeError, Decoder, YuvFrame};
+use rusty_h264_common::YuvFrame;
+use rusty_h264_decoder::{DecodeError, Decoder};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 
 /// 8192 x 4608 and the like. Beyond this a small hostile file could ask for gigabytes of picture buffers.
