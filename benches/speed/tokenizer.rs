@@ -5,7 +5,8 @@ use reviv::engine::{Compute, Initialise};
 use reviv::modality::Shape;
 use reviv::tokenizer::trained::{Prepared, batch};
 use reviv::tokenizer::vq::{Loss, VqSettings, VqVae};
-use reviv::training::tokenizer::{TokenizerTraining, Trainer};
+use reviv::training::tokenizer::TokenizerTraining;
+use reviv::training::{Trainer, TrainingError};
 
 /// Clips per step.
 const BATCH: usize = 8;
@@ -53,9 +54,9 @@ pub fn run(meter: &Meter) {
         batch: BATCH,
         ..TokenizerTraining::default()
     };
-    let mut trainer =
-        Trainer::new(model, &settings, 0).expect("warm-up is shorter than 1000 steps");
+    let mut trainer = Trainer::vq(model, &settings, 0).expect("warm-up is shorter than 1000 steps");
     meter.measure("train step", || {
-        trainer.step(&data).expect("the data are finite");
+        let next = |_| Ok::<_, TrainingError>(data.clone());
+        trainer.step(next).expect("the data are finite");
     });
 }

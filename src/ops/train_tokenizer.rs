@@ -23,7 +23,7 @@ use crate::tokenizer::video::Network;
 use crate::tokenizer::video::padding::Padding;
 use crate::tokenizer::vq::VqVae;
 use crate::training::tokenizer::TokenizerTraining;
-use crate::training::{AdamWSettings, Duration};
+use crate::training::{AdamWSettings, Duration, Keep};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
@@ -42,6 +42,8 @@ pub struct TrainTokenizerSettings {
     /// Signals per step.
     #[schemars(range(min = 1))]
     pub batch: usize,
+    /// Signals per forward pass; a larger `batch` accumulates gradients. 0 means `batch`.
+    pub micro_batch: usize,
     /// Peak learning rate; it falls along half a cosine.
     pub learning_rate: f64,
     /// Linear rise from 0: `{steps: n}` or `{epochs: x}`.
@@ -55,6 +57,10 @@ pub struct TrainTokenizerSettings {
     pub mirror: bool,
     /// Checkpoint after every so many steps; 0: only when interrupted.
     pub checkpoint_every: u64,
+    /// Held-out loss after every so many steps; 0: not while it trains.
+    pub validate_every: u64,
+    /// Which weights the tokenizer has in the end.
+    pub keep: Keep,
     /// At most so many held-out clips are scored.
     #[schemars(range(min = 1))]
     pub validation_clips: usize,
@@ -72,12 +78,15 @@ impl Default for TrainTokenizerSettings {
             tokenizer: None,
             steps: training.steps,
             batch: training.batch,
-            learning_rate: training.rate,
+            micro_batch: training.micro_batch,
+            learning_rate: training.learning_rate,
             warmup: Duration::Steps(training.warmup),
             optimizer: training.optimizer,
             calibrate: true,
             mirror: true,
             checkpoint_every: 500,
+            validate_every: 0,
+            keep: training.keep,
             validation_clips: 1000,
             kmeans: true,
             device: DeviceChoice::Cpu,
@@ -91,9 +100,11 @@ impl TrainTokenizerSettings {
         TokenizerTraining {
             steps: self.steps,
             batch: self.batch,
-            rate: self.learning_rate,
+            micro_batch: self.micro_batch,
+            learning_rate: self.learning_rate,
             warmup: self.warmup_steps(signals).unwrap_or_default(),
             optimizer: self.optimizer.clone(),
+            keep: self.keep,
         }
     }
 
@@ -106,6 +117,11 @@ impl TrainTokenizerSettings {
             }
             Duration::Epochs(_) | Duration::Tokens(_) => None,
         }
+    }
+
+    /// Whether held-out losses are computed while it trains.
+    fn validates(&self) -> bool {
+        self.validate_every > 0 || self.keep == Keep::Best
     }
 
     /// The tokenizer that is named here, or else by the entry of the modality, as a clips artifact passes it on.
@@ -137,7 +153,7 @@ impl Op for TrainTokenizer {
     }
 
     fn version(&self) -> u32 {
-        4
+        5
     }
 
     fn about(&self) -> &'static str {

@@ -42,6 +42,8 @@ pub struct TrainingSettings {
     pub validate_every: u64,
     /// At most this many validation clips, always the same with the same masks.
     pub validation_clips: usize,
+    /// Which weights the model has in the end.
+    pub keep: Keep,
     /// Checkpoint after every so many steps; 0: only when interrupted.
     pub checkpoint_every: u64,
     /// Threads that prepare batches ahead. Results do not depend on it.
@@ -67,10 +69,22 @@ impl Default for TrainingSettings {
             repeat: 1,
             validate_every: 0,
             validation_clips: 256,
+            keep: Keep::Last,
             checkpoint_every: 500,
             loader_threads: 1,
         }
     }
+}
+
+/// Which weights a trained model has.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum Keep {
+    /// Those after the last step.
+    #[default]
+    Last,
+    /// Those with the lowest held-out loss, of the steps at which it was computed (`validate_every`).
+    Best,
 }
 
 /// A stretch of training.
@@ -188,18 +202,20 @@ impl TrainingSettings {
     /// Samples of each micro-batch of a step.
     #[must_use]
     pub fn micro_batches(&self) -> Vec<usize> {
-        let size = match self.micro_batch {
-            0 => self.batch,
-            size => size.min(self.batch),
-        };
-        let mut left = self.batch;
-        let mut sizes = Vec::new();
-        while left > 0 {
-            sizes.push(size.min(left));
-            left -= size.min(left);
-        }
-        sizes
+        micro_batches(self.batch, self.micro_batch)
     }
+}
+
+/// Samples of each forward pass of a step of `batch` samples, `size` (0: all) at a time.
+pub(super) fn micro_batches(batch: usize, size: usize) -> Vec<usize> {
+    let size = if size == 0 { batch } else { size.min(batch) };
+    let mut left = batch;
+    let mut sizes = Vec::new();
+    while left > 0 {
+        sizes.push(size.min(left));
+        left -= size.min(left);
+    }
+    sizes
 }
 
 #[cfg(test)]

@@ -1,22 +1,32 @@
-//! Training a VQ-VAE tokenizer (Supp. A): one step, the order of the data, a checkpoint that resumes to the same bytes.
-//!
-//! Everything a step does is a function of the seed, the step and the state: the clips it sees, the codes it replaces, the
-//! learning rate. A checkpoint is weights, moments and the step.
+//! Training VQ-VAE and video tokenizers (Supp. A; the paper takes Cosmos as released) as [`Objective`]s, and which signals each
+//! step sees.
 
 use ndarray::Ix3;
 use rand::seq::SliceRandom;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 
-use super::optimizer::{AdamW, AdamWSettings, NotFinite};
-use super::schedule::{Schedule, ScheduleError, Shape};
+use super::optimizer::AdamWSettings;
+use super::schedule::{Schedule, Shape};
+use super::settings::{Keep, micro_batches};
+use super::trainer::{MicroStep, Objective, Progress, Trainer, TrainingError};
+use super::validation::Score;
 use crate::clip::Signal;
-use crate::engine::{EngineError, Gradients, Parameters, Weights};
+use crate::engine::parameters::to_host;
+use crate::engine::{Gradients, Parameters};
 use crate::geometry::skeleton::HAND;
 use crate::random::stream;
-use crate::tokenizer::TokenizerError;
+use crate::tokenizer::quantizer::Assignment;
 use crate::tokenizer::trained::{Prepared, batch};
+use crate::tokenizer::video::{Network, VideoTokenizer};
 use crate::tokenizer::vq::VqVae;
+
+/// Weight of the latents' unevenness beside the error of pixels.
+const EVENNESS: f64 = 0.01;
+
+/// Held-out signals per forward pass.
+const HELD_OUT: usize = 16;
 
 /// How a tokenizer trains.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -28,12 +38,16 @@ pub struct TokenizerTraining {
     /// Signals per step.
     #[schemars(range(min = 1))]
     pub batch: usize,
+    /// Signals per forward pass; a larger `batch` accumulates gradients. 0 means `batch`.
+    pub micro_batch: usize,
     /// Peak learning rate.
-    pub rate: f64,
+    pub learning_rate: f64,
     /// Steps until the peak.
     pub warmup: u64,
     /// The optimizer.
     pub optimizer: AdamWSettings,
+    /// Which weights the tokenizer has in the end.
+    pub keep: Keep,
 }
 
 impl Default for TokenizerTraining {
@@ -41,189 +55,279 @@ impl Default for TokenizerTraining {
         Self {
             steps: 1000,
             batch: 16,
-            rate: 1e-3,
+            micro_batch: 0,
+            learning_rate: 1e-3,
             warmup: 50,
             optimizer: AdamWSettings {
                 betas: [0.9, 0.99],
                 ..AdamWSettings::default()
             },
+            keep: Keep::Last,
         }
     }
 }
 
-/// What one step reports.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct StepReport {
-    pub loss: f64,
-    pub reconstruction: f64,
-    pub commitment: f64,
-    /// Of all gradients together, before clipping.
-    pub gradient_norm: f64,
-    pub rate: f64,
-    /// Codes that were replaced.
-    pub replaced: usize,
-}
-
-/// Why a step or a resume was refused.
-#[derive(Debug, thiserror::Error)]
-pub enum TrainingError {
-    /// Steps are counted from 1.
-    #[error("the loss of step {step} is {loss}; the last good checkpoint is kept")]
-    NotFinite { step: u64, loss: f64 },
-    #[error("{0}; the last good checkpoint is kept")]
-    Gradient(#[from] NotFinite),
-    #[error("there is nothing to train on")]
-    NoData,
-    #[error(transparent)]
-    Tokenizer(#[from] TokenizerError),
-    #[error(transparent)]
-    Schedule(#[from] ScheduleError),
-    #[error(transparent)]
-    Engine(#[from] EngineError),
-}
-
-/// A training run between two steps.
-#[derive(Debug, Clone)]
-pub struct Trainer {
-    model: VqVae,
-    optimizer: AdamW,
-    schedule: Schedule,
-    epochs: Epochs,
-    seed: u64,
+impl TokenizerTraining {
+    fn start<O: Objective>(&self, objective: O) -> Result<Trainer<O>, TrainingError> {
+        let (peak, steps) = (self.learning_rate, self.steps);
+        Ok(Trainer::start(
+            objective,
+            self.optimizer.clone(),
+            Schedule::new(Shape::Cosine, peak, 0.0, self.warmup, steps)?,
+            micro_batches(self.batch, self.micro_batch),
+            self.keep,
+        ))
+    }
 }
 
 /// Which signals each step sees: epochs are permutations, drawn for (seed, epoch), read one after the other.
 #[derive(Debug, Clone)]
-pub(super) struct Epochs {
+pub struct Epochs {
     seed: u64,
-    batch: usize,
+    micro_batches: Vec<usize>,
     /// The order of the epoch it was last asked for.
     order: (u64, Vec<usize>),
 }
 
 impl Epochs {
-    pub(super) fn new(seed: u64, batch: usize) -> Self {
+    /// The order of a run of `trainer`, under a seed.
+    #[must_use]
+    pub fn of<O: Objective>(trainer: &Trainer<O>, seed: u64) -> Self {
+        Self::new(seed, trainer.micro_batches().to_vec())
+    }
+
+    fn new(seed: u64, micro_batches: Vec<usize>) -> Self {
         Self {
             seed,
-            batch: batch.max(1),
+            micro_batches,
             order: (u64::MAX, Vec::new()),
         }
     }
 
-    /// The signals of `step`, of `count` (at least 1) that there are.
-    pub(super) fn choose(&mut self, step: u64, count: usize) -> Vec<usize> {
-        let first = step * self.batch as u64;
-        (first..first + self.batch as u64)
-            .map(|place| {
-                let epoch = place / count as u64;
-                if self.order.0 != epoch || self.order.1.len() != count {
-                    let mut order: Vec<usize> = (0..count).collect();
-                    order.shuffle(&mut stream(self.seed, "train_tokenizer.order", epoch, 0));
-                    self.order = (epoch, order);
-                }
-                self.order.1[(place % count as u64) as usize]
-            })
-            .collect()
+    /// The signals of micro-batch `micro` of `step`, of `count` that there are.
+    ///
+    /// # Errors
+    /// When there are none.
+    pub fn choose(
+        &mut self,
+        step: u64,
+        micro: usize,
+        count: usize,
+    ) -> Result<Vec<usize>, TrainingError> {
+        if count == 0 {
+            return Err(TrainingError::NoData);
+        }
+        let per_step: usize = self.micro_batches.iter().sum();
+        let before: usize = self.micro_batches[..micro].iter().sum();
+        let first = step * per_step as u64 + before as u64;
+        let mut at = |n: u64| {
+            let epoch = n / count as u64;
+            if self.order.0 != epoch || self.order.1.len() != count {
+                let mut order: Vec<usize> = (0..count).collect();
+                order.shuffle(&mut stream(self.seed, "train_tokenizer.order", epoch, 0));
+                self.order = (epoch, order);
+            }
+            self.order.1[(n % count as u64) as usize]
+        };
+        let size = self.micro_batches[micro] as u64;
+        Ok((first..first + size).map(&mut at).collect())
     }
 }
 
-impl Trainer {
-    /// A run from the start.
+/// A VQ-VAE, trained to reconstruct signals; its codes follow running means of their latents.
+#[derive(Debug, Clone)]
+pub struct VqReconstruction {
+    model: VqVae,
+    seed: u64,
+}
+
+impl VqReconstruction {
+    /// The reconstruction loss of held-out signals; nothing where there are none.
+    #[must_use]
+    pub fn held_out(&self, signals: &[Prepared]) -> BTreeMap<String, Score> {
+        let model = self.model.frozen();
+        let losses = signals.chunks(HELD_OUT).map(|chunk| {
+            let batch = batch(&model, chunk);
+            let found = model.decode(&model.encode(&batch), chunk.len());
+            (
+                f64::from(to_host(model.loss(found, &batch))[0]),
+                chunk.len(),
+            )
+        });
+        mean_of(losses)
+    }
+}
+
+/// The mean over signals, as the score of what is reconstructed.
+fn mean_of(losses: impl Iterator<Item = (f64, usize)>) -> BTreeMap<String, Score> {
+    let (sum, signals) = losses.fold((0.0, 0), |(sum, count), (loss, n)| {
+        (sum + loss * n as f64, count + n)
+    });
+    let score = (signals > 0).then(|| Score {
+        loss: sum / signals as f64,
+        tokens: signals,
+    });
+    score
+        .map(|score| ("reconstruction".to_owned(), score))
+        .into_iter()
+        .collect()
+}
+
+impl Trainer<VqReconstruction> {
+    /// Starts to train a VQ-VAE; `seed` draws the latents that replace dead codes.
     ///
     /// # Errors
     /// When warm-up is longer than the run.
-    pub fn new(
-        mut model: VqVae,
+    pub fn vq(
+        model: VqVae,
         settings: &TokenizerTraining,
         seed: u64,
     ) -> Result<Self, TrainingError> {
-        model.start_training();
-        Ok(Self {
-            optimizer: AdamW::new(settings.optimizer.clone(), &model),
-            schedule: Schedule::new(
-                Shape::Cosine,
-                settings.rate,
-                0.0,
-                settings.warmup,
-                settings.steps,
-            )?,
-            epochs: Epochs::new(seed, settings.batch),
-            seed,
-            model,
-        })
+        settings.start(VqReconstruction { model, seed })
     }
+}
 
-    #[must_use]
-    pub fn model(&self) -> &VqVae {
+impl Objective for VqReconstruction {
+    type Module = VqVae;
+    type Batch = Vec<Prepared>;
+    type Trace = Assignment;
+
+    fn module(&self) -> &VqVae {
         &self.model
     }
 
-    /// How many steps were taken.
-    #[must_use]
-    pub fn steps(&self) -> u64 {
-        self.optimizer.steps()
+    fn module_mut(&mut self) -> &mut VqVae {
+        &mut self.model
     }
 
-    #[must_use]
-    pub fn finished(&self) -> bool {
-        self.steps() >= self.schedule.total()
-    }
-
-    /// Takes one step on `data`, normalised signals.
-    ///
-    /// # Errors
-    /// When there is no data, or the loss or its gradient is not finite; nothing has changed then.
-    pub fn step(&mut self, data: &[Prepared]) -> Result<StepReport, TrainingError> {
-        if data.is_empty() {
-            return Err(TrainingError::NoData);
-        }
-        let step = self.steps();
-        let chosen: Vec<Prepared> = self
-            .epochs
-            .choose(step, data.len())
-            .into_iter()
-            .map(|i| data[i].clone())
-            .collect();
-        let trained = self.model.forward_training(&batch(&self.model, &chosen));
+    fn micro_step(
+        &self,
+        signals: &Vec<Prepared>,
+        share: f64,
+    ) -> Result<MicroStep<Assignment>, TrainingError> {
+        let trained = self.model.forward_training(&batch(&self.model, signals));
         let weight = self.model.settings().commitment_weight;
         let loss = trained.reconstruction + weight * trained.commitment;
-        if !loss.is_finite() {
-            let step = step + 1;
-            return Err(TrainingError::NotFinite { step, loss });
-        }
-        let gradients = Gradients::of(&trained.loss, &self.model);
-        let rate = self.schedule.rate(step);
-        let gradient_norm = self.optimizer.step(&mut self.model, gradients, rate)?;
-        let quantizer = self.model.quantizer_mut();
-        let sums = quantizer.sums(&trained.assignment);
-        let update = quantizer.update(&sums, &trained.assignment.unit, self.seed, step);
-        Ok(StepReport {
+        let samples = signals.len() as f64;
+        Ok(MicroStep {
             loss,
-            reconstruction: trained.reconstruction,
-            commitment: trained.commitment,
-            gradient_norm,
-            rate,
-            replaced: update.dead.len(),
+            parts: vec![
+                (
+                    "loss/reconstruction".into(),
+                    trained.reconstruction,
+                    samples,
+                ),
+                ("loss/commitment".into(), trained.commitment, samples),
+            ],
+            gradients: loss
+                .is_finite()
+                .then(|| Gradients::of(&(trained.loss * share), &self.model)),
+            used: used(signals.len()),
+            trace: trained.assignment,
         })
     }
 
-    /// Everything that the next step depends on, besides settings, seed and data.
+    fn finish_step(&mut self, traces: Vec<Assignment>, step: u64) -> Vec<(String, f64)> {
+        let mut whole = Assignment {
+            ids: Vec::new(),
+            unit: Vec::new(),
+        };
+        for mut assignment in traces {
+            whole.ids.append(&mut assignment.ids);
+            whole.unit.append(&mut assignment.unit);
+        }
+        let quantizer = self.model.quantizer_mut();
+        let sums = quantizer.sums(&whole);
+        let update = quantizer.update(&sums, &whole.unit, self.seed, step);
+        vec![("codes/replaced".into(), update.dead.len() as f64)]
+    }
+}
+
+/// A video tokenizer, trained on the squared error of pixels and on even use of the codes.
+#[derive(Debug, Clone)]
+pub struct VideoReconstruction {
+    model: VideoTokenizer,
+}
+
+impl VideoReconstruction {
+    /// The tokenizer as it is now; it records nothing.
     #[must_use]
-    pub fn checkpoint(&self) -> Weights {
-        let mut weights = Weights::default();
-        weights.add_below("model", self.model.weights());
-        weights.add_below("optimizer", self.optimizer.state());
-        weights
+    pub fn tokenizer(&self) -> VideoTokenizer {
+        let mut tokenizer = self.model.clone();
+        *tokenizer.network_mut() = self.model.network().frozen();
+        tokenizer
     }
 
-    /// Continues from a checkpoint of the same settings.
+    /// The squared error of pixels of held-out clips; nothing where there are none.
     ///
     /// # Errors
-    /// When it is of another model.
-    pub fn restore(&mut self, checkpoint: &Weights) -> Result<(), TrainingError> {
-        self.model.load(&checkpoint.below("model"))?;
-        self.optimizer.restore(&checkpoint.below("optimizer"))?;
-        Ok(())
+    /// What `clips` says, or when a clip has another size.
+    pub fn held_out<E: From<TrainingError>>(
+        &self,
+        clips: impl Iterator<Item = Result<Option<Signal>, E>>,
+    ) -> Result<BTreeMap<String, Score>, E> {
+        let tokenizer = self.tokenizer();
+        let mut losses = Vec::new();
+        for clip in clips {
+            if let Some(clip) = clip? {
+                let trained = tokenizer.train(&[clip]).map_err(TrainingError::from)?;
+                losses.push((f64::from(trained.loss.into_scalar::<f32>()), 1));
+            }
+        }
+        Ok(mean_of(losses.into_iter()))
+    }
+}
+
+impl Trainer<VideoReconstruction> {
+    /// Starts to train a video tokenizer.
+    ///
+    /// # Errors
+    /// When warm-up is longer than the run.
+    pub fn video(
+        model: VideoTokenizer,
+        settings: &TokenizerTraining,
+    ) -> Result<Self, TrainingError> {
+        settings.start(VideoReconstruction { model })
+    }
+}
+
+impl Objective for VideoReconstruction {
+    type Module = Network;
+    type Batch = Vec<Signal>;
+    type Trace = ();
+
+    fn module(&self) -> &Network {
+        self.model.network()
+    }
+
+    fn module_mut(&mut self) -> &mut Network {
+        self.model.network_mut()
+    }
+
+    fn micro_step(&self, clips: &Vec<Signal>, share: f64) -> Result<MicroStep<()>, TrainingError> {
+        if clips.is_empty() {
+            return Err(TrainingError::NoData);
+        }
+        let trained = self.model.train(clips)?;
+        let loss = f64::from(trained.loss.clone().into_scalar::<f32>());
+        let gradients = loss.is_finite().then(|| {
+            let total = trained.loss + trained.unevenness * EVENNESS;
+            Gradients::of(&(total * share), self.model.network())
+        });
+        Ok(MicroStep {
+            loss,
+            parts: Vec::new(),
+            gradients,
+            used: used(clips.len()),
+            trace: (),
+        })
+    }
+}
+
+fn used(signals: usize) -> Progress {
+    Progress {
+        samples: signals as u64,
+        ..Progress::default()
     }
 }
 
@@ -244,14 +348,28 @@ pub fn mirrored(signal: &Signal) -> Result<Signal, ndarray::ShapeError> {
 mod tests {
     use super::*;
     use crate::engine::{Compute, Initialise};
+    use crate::tokenizer::video::testing::small;
     use crate::tokenizer::vq::VqSettings;
+    use crate::training::fit::{Event, Flow, Intervals, fit};
+    use ndarray::{ArrayD, IxDyn};
+    use std::path::Path;
 
     const SHAPE: crate::modality::Shape = crate::modality::Shape::Temporal {
         samples: 8,
         channels: 2,
     };
 
-    fn trainer(steps: u64) -> Trainer {
+    fn settings(steps: u64, micro_batch: usize) -> TokenizerTraining {
+        TokenizerTraining {
+            steps,
+            batch: 8,
+            micro_batch,
+            warmup: 2,
+            ..TokenizerTraining::default()
+        }
+    }
+
+    fn trainer(settings: &TokenizerTraining) -> Trainer<VqReconstruction> {
         let compute = Compute::cpu();
         let sizes = VqSettings {
             codebook: 32,
@@ -262,13 +380,7 @@ mod tests {
             ..VqSettings::default()
         };
         let model = VqVae::new(&Initialise::new(&compute, 4), &sizes, &SHAPE).unwrap();
-        let training = TokenizerTraining {
-            steps,
-            batch: 8,
-            warmup: 2,
-            ..TokenizerTraining::default()
-        };
-        Trainer::new(model, &training, 4).unwrap()
+        Trainer::vq(model, settings, 4).unwrap()
     }
 
     fn data() -> Vec<Prepared> {
@@ -282,34 +394,70 @@ mod tests {
             .collect()
     }
 
+    fn step(trainer: &mut Trainer<VqReconstruction>, data: &[Prepared]) -> f64 {
+        let mut epochs = Epochs::of(trainer, 4);
+        let step = trainer.progress().step;
+        let report = trainer.step(|micro| -> Result<_, TrainingError> {
+            let chosen = epochs.choose(step, micro, data.len())?;
+            Ok(chosen.into_iter().map(|i| data[i].clone()).collect())
+        });
+        report.unwrap().parts[0].1
+    }
+
+    /// The bytes of a checkpoint.
+    fn bytes<O: Objective>(trainer: &Trainer<O>) -> Vec<u8> {
+        let folder = tempfile::tempdir().unwrap();
+        trainer.save(folder.path()).unwrap();
+        let mut files: Vec<_> = std::fs::read_dir(folder.path())
+            .unwrap()
+            .map(|entry| entry.unwrap().path())
+            .collect();
+        files.sort();
+        files
+            .iter()
+            .flat_map(|file| std::fs::read(file).unwrap())
+            .collect()
+    }
+
     #[test]
     fn training_lowers_the_error_and_a_killed_run_resumes_to_the_same_bytes() {
         let data = data();
-        let mut whole = trainer(60);
-        let mut losses = Vec::new();
-        let mut stored = None;
-        while !whole.finished() {
-            if whole.steps() == 23 {
-                stored = Some(whole.checkpoint().to_bytes());
+        for micro_batch in [0, 3] {
+            let settings = settings(60, micro_batch);
+            let mut whole = trainer(&settings);
+            let stored = tempfile::tempdir().unwrap();
+            let mut losses = Vec::new();
+            for at in 0..60 {
+                if at == 23 {
+                    whole.save(stored.path()).unwrap();
+                }
+                losses.push(step(&mut whole, &data));
             }
-            losses.push(whole.step(&data).unwrap().reconstruction);
-        }
-        assert!(
-            losses[59] < 0.5 * losses[0],
-            "{} to {}",
-            losses[0],
-            losses[59]
-        );
+            let (first, last) = (losses[0], losses[59]);
+            assert!(last < 0.5 * first, "{first} to {last}");
 
-        let mut resumed = trainer(60);
-        resumed
-            .restore(&Weights::from_bytes(&stored.unwrap()).unwrap())
-            .unwrap();
-        assert_eq!(resumed.steps(), 23);
-        while !resumed.finished() {
-            resumed.step(&data).unwrap();
+            let mut resumed = trainer(&settings);
+            resumed.resume(stored.path()).unwrap();
+            assert_eq!(resumed.progress().step, 23);
+            for _ in 23..60 {
+                step(&mut resumed, &data);
+            }
+            assert!(bytes(&resumed) == bytes(&whole));
         }
-        assert!(resumed.checkpoint().to_bytes() == whole.checkpoint().to_bytes());
+    }
+
+    #[test]
+    fn micro_batches_of_a_step_add_up_to_it() {
+        let data = data();
+        let (mut whole, mut parts) = (trainer(&settings(3, 0)), trainer(&settings(3, 2)));
+        // Signals that are valid throughout: a mean over valid values is no mean over signals.
+        let data: Vec<Prepared> = data.into_iter().filter(|d| d.valid.is_none()).collect();
+        for at in 0..3 {
+            let (a, b) = (step(&mut whole, &data), step(&mut parts, &data));
+            assert!((a - b).abs() < 1e-4, "{a} {b}");
+            let (a, b) = (whole.model().quantizer(), parts.model().quantizer());
+            assert!(at > 0 || a.counts() == b.counts());
+        }
     }
 
     #[test]
@@ -321,11 +469,11 @@ mod tests {
                 .build()
                 .unwrap();
             pool.install(|| {
-                let mut trainer = trainer(6);
-                while !trainer.finished() {
-                    trainer.step(&data).unwrap();
+                let mut trainer = trainer(&settings(6, 0));
+                for _ in 0..6 {
+                    step(&mut trainer, &data);
                 }
-                trainer.checkpoint().to_bytes()
+                bytes(&trainer)
             })
         };
         let one = on(1);
@@ -334,36 +482,138 @@ mod tests {
 
     #[test]
     fn a_loss_that_is_not_finite_stops_with_the_step_and_changes_nothing() {
-        let mut trainer = trainer(5);
-        trainer.step(&data()).unwrap();
-        let before = trainer.checkpoint();
-        let huge = vec![Prepared {
+        let mut trainer = trainer(&settings(5, 0));
+        step(&mut trainer, &data());
+        let before = bytes(&trainer);
+        let huge = Prepared {
             values: vec![1e30; 16],
             valid: None,
-        }];
-        let error = trainer.step(&huge).unwrap_err();
-        assert!(error.to_string().contains("loss of step 2 is"), "{error}");
-        assert_eq!(trainer.checkpoint(), before);
-        let gradient = NotFinite {
-            step: 2,
-            norm: f64::INFINITY,
         };
-        let message = TrainingError::from(gradient).to_string();
-        assert!(message.contains("gradient of step 2"), "{message}");
+        let next = |_| Ok::<_, TrainingError>(vec![huge.clone(); 8]);
+        let error = trainer.step(next).unwrap_err().to_string();
+        assert!(error.contains("loss of step 2 is"), "{error}");
+        assert!(bytes(&trainer) == before);
     }
 
     #[test]
     fn every_signal_is_seen_once_per_epoch() {
-        let mut trainer = trainer(50);
-        let seen: Vec<usize> = (0..5)
-            .flat_map(|step| trainer.epochs.choose(step, 20))
-            .collect();
+        let mut epochs = Epochs::new(4, vec![5, 3]);
+        let mut seen = Vec::new();
+        for step in 0..5 {
+            for micro in 0..2 {
+                seen.extend(epochs.choose(step, micro, 20).unwrap());
+            }
+        }
         for epoch in seen.chunks(20) {
             let mut epoch = epoch.to_vec();
             epoch.sort_unstable();
             assert_eq!(epoch, (0..20).collect::<Vec<_>>());
         }
         assert_ne!(seen[..20], seen[20..]);
+        assert!(epochs.choose(0, 0, 0).is_err());
+    }
+
+    /// Fits with held-out losses that fall until step 4 and rise again; stopped and resumed at `cut`.
+    fn fitted(keep: Keep, cut: Option<u64>) -> (u64, crate::engine::Weights) {
+        let (data, kept) = (data(), tempfile::tempdir().unwrap());
+        let settings = TokenizerTraining {
+            keep,
+            ..settings(9, 0)
+        };
+        let run = |trainer: &mut Trainer<VqReconstruction>, cut: Option<u64>, kept: &Path| {
+            let mut epochs = Epochs::of(trainer, 4);
+            let mut step = trainer.progress().step;
+            fit(
+                trainer,
+                Intervals {
+                    validate_every: 2,
+                    checkpoint_every: 0,
+                },
+                |step, micro| -> Result<_, TrainingError> {
+                    let chosen = epochs.choose(step, micro, data.len())?;
+                    Ok(chosen.into_iter().map(|i| data[i].clone()).collect())
+                },
+                |_| {
+                    step = (step / 2 + 1) * 2;
+                    let loss = (step as f64 - 4.0).abs();
+                    let score = Score { loss, tokens: 1 };
+                    Ok(BTreeMap::from([("x".to_owned(), score)]))
+                },
+                |event| match event {
+                    Event::Step { report, .. } if Some(report.step) == cut => Ok(Flow::Stop),
+                    Event::Checkpoint(trainer) => trainer.save(kept).map(|()| Flow::Continue),
+                    _ => Ok(Flow::Continue),
+                },
+            )
+            .unwrap()
+        };
+        let mut trainer = trainer(&settings);
+        let mut done = run(&mut trainer, cut, kept.path());
+        if let Some(cut) = cut {
+            assert_eq!((done.flow, done.held_out.step), (Flow::Stop, cut));
+            trainer = self::trainer(&settings);
+            trainer.resume(kept.path()).unwrap();
+            done = run(&mut trainer, None, kept.path());
+        }
+        assert_eq!(done.flow, Flow::Continue);
+        (done.held_out.step, trainer.model().weights())
+    }
+
+    #[test]
+    fn the_best_weights_are_kept_where_asked_for_and_survive_a_stop() {
+        let (step, best) = fitted(Keep::Best, None);
+        let (last_step, last) = fitted(Keep::Last, None);
+        assert_eq!((step, last_step), (4, 9));
+        assert!(best != last);
+        for cut in [3, 4, 6] {
+            assert!(fitted(Keep::Best, Some(cut)) == (4, best.clone()), "{cut}");
+            assert!(fitted(Keep::Last, Some(cut)) == (9, last.clone()), "{cut}");
+        }
+    }
+
+    #[test]
+    fn a_video_tokenizer_learns_and_resumes_to_the_same_bytes() {
+        let start = || {
+            let settings = TokenizerTraining {
+                learning_rate: 3e-3,
+                batch: 2,
+                ..settings(8, 0)
+            };
+            Trainer::video(small([4, 16, 16], [4, 4], &[4, 3], 2), &settings).unwrap()
+        };
+        let step = |trainer: &mut Trainer<VideoReconstruction>| {
+            let mut epochs = Epochs::of(trainer, 5);
+            let step = trainer.progress().step;
+            let clip = |clip: usize| Signal {
+                values: ArrayD::from_shape_fn(IxDyn(&[4, 16, 16, 3]), |at| {
+                    ((at[0] + 2 * at[1] + at[2] + 5 * clip) as f32 * 0.2).sin()
+                }),
+                valid: None,
+            };
+            let next = |micro| -> Result<Vec<Signal>, TrainingError> {
+                Ok(epochs
+                    .choose(step, micro, 5)?
+                    .into_iter()
+                    .map(clip)
+                    .collect())
+            };
+            trainer.step(next).unwrap().loss
+        };
+        let (mut whole, stored) = (start(), tempfile::tempdir().unwrap());
+        let mut losses = Vec::new();
+        for at in 0..8 {
+            if at == 3 {
+                whole.save(stored.path()).unwrap();
+            }
+            losses.push(step(&mut whole));
+        }
+        assert!(losses[7] < losses[0], "{losses:?}");
+        let mut resumed = start();
+        resumed.resume(stored.path()).unwrap();
+        for _ in 3..8 {
+            step(&mut resumed);
+        }
+        assert!(bytes(&resumed) == bytes(&whole));
     }
 
     #[test]

@@ -1,23 +1,77 @@
-//! One training step, and the state between steps (Supp. B).
+//! One training step, and the state between steps (Supp. A and B): the same for MGET, VQ-VAEs and video tokenizers.
+//!
+//! What differs is an [`Objective`]: the module, its loss on a micro-batch, and what a step changes that no gradient does
+//! (codebooks). Everything a step does is a function of the seed, the step and the state.
 
-use super::optimizer::{AdamW, NotFinite};
-use super::schedule::Schedule;
-use super::settings::TrainingSettings;
+use super::optimizer::{AdamW, AdamWSettings, NotFinite};
+use super::schedule::{Schedule, ScheduleError};
+use super::settings::Keep;
 use super::source::DataError;
+use super::validation::Score;
 use crate::engine::{EngineError, Gradients, Parameters, Weights};
-use crate::mget::{Batch, Loss, LossValues, Mget};
+use crate::formats::ReadError;
+use crate::tokenizer::TokenizerError;
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// A model in training.
+/// What is trained, and what it is trained to do.
+pub trait Objective {
+    /// The parameters.
+    type Module: Parameters;
+    /// What one forward pass takes.
+    type Batch;
+    /// What a micro-batch leaves for [`Objective::finish_step`].
+    type Trace;
+
+    /// The module in training.
+    fn module(&self) -> &Self::Module;
+
+    /// The module, to be changed by the optimizer or a checkpoint.
+    fn module_mut(&mut self) -> &mut Self::Module;
+
+    /// The loss of a micro-batch, and the gradients of `share` times it; changes nothing.
+    ///
+    /// # Errors
+    /// When the batch does not fit the module.
+    fn micro_step(
+        &self,
+        batch: &Self::Batch,
+        share: f64,
+    ) -> Result<MicroStep<Self::Trace>, TrainingError>;
+
+    /// What the step changes besides what the gradients did, after the optimizer; `step` is counted from 0. Returns further
+    /// numbers for the report.
+    fn finish_step(&mut self, traces: Vec<Self::Trace>, step: u64) -> Vec<(String, f64)> {
+        let _ = (traces, step);
+        Vec::new()
+    }
+}
+
+/// What a forward and backward pass over one micro-batch gave.
 #[derive(Debug)]
-pub struct Trainer {
-    model: Mget,
+pub struct MicroStep<T> {
+    /// What is minimised.
+    pub loss: f64,
+    /// Parts of the loss by name: mean, and its weight among micro-batches.
+    pub parts: Vec<(String, f64, f64)>,
+    /// `None` where nothing was asked for, or the loss is not finite.
+    pub gradients: Option<Gradients>,
+    /// Samples and tokens of the micro-batch; `step` is 0.
+    pub used: Progress,
+    /// For [`Objective::finish_step`].
+    pub trace: T,
+}
+
+/// A model in training.
+#[derive(Debug, Clone)]
+pub struct Trainer<O> {
+    objective: O,
     optimizer: AdamW,
     schedule: Schedule,
-    loss: Loss,
-    batch: usize,
-    activation_checkpointing: bool,
+    micro_batches: Vec<usize>,
+    keep: Keep,
+    best: Option<Best>,
     progress: Progress,
 }
 
@@ -28,7 +82,7 @@ pub struct Progress {
     pub step: u64,
     /// Samples used.
     pub samples: u64,
-    /// EncoderInput tokens that were there, without padding or lost budget.
+    /// Input tokens that were there, without padding or lost budget.
     pub input_tokens: u64,
     /// Target tokens that were there.
     pub target_tokens: u64,
@@ -41,8 +95,8 @@ pub struct StepReport {
     pub step: u64,
     /// What was minimised.
     pub loss: f64,
-    /// Mean cross-entropy per modality of the spec (nats) and its tokens; `None` when it was not asked for.
-    pub modalities: Vec<Option<(f64, usize)>>,
+    /// Parts of the loss and other numbers by name: `loss/body`, `loss/commitment`, `codes/replaced`.
+    pub parts: Vec<(String, f64)>,
     /// Learning rate.
     pub learning_rate: f64,
     /// Global norm before clipping.
@@ -51,15 +105,63 @@ pub struct StepReport {
     pub progress: Progress,
 }
 
+impl StepReport {
+    /// Everything by name, for the record of a run.
+    #[must_use]
+    pub fn scalars(&self) -> Vec<(&str, f64)> {
+        let mut scalars = vec![
+            ("loss", self.loss),
+            ("learning_rate", self.learning_rate),
+            ("gradient_norm", self.gradient_norm),
+        ];
+        scalars.extend(self.parts.iter().map(|(name, v)| (name.as_str(), *v)));
+        scalars
+    }
+}
+
+/// Held-out losses at one step, by what was predicted.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct HeldOut {
+    /// After how many steps.
+    pub step: u64,
+    /// By modality.
+    pub scores: BTreeMap<String, Score>,
+}
+
+impl HeldOut {
+    /// The mean over modalities; `None` where nothing was held out.
+    #[must_use]
+    pub fn mean(&self) -> Option<f64> {
+        let sum: f64 = self.scores.values().map(|score| score.loss).sum();
+        (!self.scores.is_empty()).then(|| sum / self.scores.len() as f64)
+    }
+}
+
+/// The weights with the lowest held-out loss so far.
+#[derive(Debug, Clone)]
+struct Best {
+    held_out: HeldOut,
+    weights: Weights,
+}
+
 /// Why training stopped.
 #[derive(Debug, thiserror::Error)]
 pub enum TrainingError {
+    /// Steps are counted from 1.
     #[error("the loss of step {step} is {loss}; nothing was changed, the last checkpoint is good")]
     Loss { step: u64, loss: f64 },
     #[error("{0}; nothing was changed, the last checkpoint is good")]
     Gradient(#[from] NotFinite),
+    #[error("there is nothing to train on")]
+    NoData,
     #[error(transparent)]
     Data(#[from] DataError),
+    #[error(transparent)]
+    Clips(#[from] ReadError),
+    #[error(transparent)]
+    Tokenizer(#[from] TokenizerError),
+    #[error(transparent)]
+    Schedule(#[from] ScheduleError),
     #[error(transparent)]
     Engine(#[from] EngineError),
     #[error("{path}: {reason}")]
@@ -72,56 +174,61 @@ pub enum TrainingError {
     },
 }
 
-impl Trainer {
-    /// Starts to train `model`.
+impl<O: Objective> Trainer<O> {
+    /// Starts to train. `micro_batches` are the samples of each forward pass of a step.
     #[must_use]
-    pub fn new(mut model: Mget, settings: &TrainingSettings, schedule: Schedule) -> Self {
-        let optimizer = AdamW::new(settings.optimizer.clone(), &model);
-        model.start_training();
+    pub fn start(
+        mut objective: O,
+        optimizer: AdamWSettings,
+        schedule: Schedule,
+        micro_batches: Vec<usize>,
+        keep: Keep,
+    ) -> Self {
+        let optimizer = AdamW::new(optimizer, objective.module());
+        objective.module_mut().start_training();
         Self {
-            model,
+            objective,
             optimizer,
             schedule,
-            loss: settings.loss,
-            batch: settings.batch,
-            activation_checkpointing: settings.activation_checkpointing,
+            micro_batches,
+            keep,
+            best: None,
             progress: Progress::default(),
         }
     }
 
-    /// Takes one step. `next` is called once for each of `micro_batches` micro-batches.
+    /// Takes one step; `next(i)` gives its micro-batch `i`.
     ///
     /// # Errors
-    /// When data cannot be read, or loss or gradient are not finite. Model and optimizer are as before then.
-    pub fn step(
+    /// When a batch cannot be had, or loss or gradient are not finite. Model and optimizer are as before then.
+    pub fn step<E: From<TrainingError>>(
         &mut self,
-        micro_batches: usize,
-        mut next: impl FnMut() -> Result<Batch, DataError>,
-    ) -> Result<StepReport, TrainingError> {
+        mut next: impl FnMut(usize) -> Result<O::Batch, E>,
+    ) -> Result<StepReport, E> {
         let mut progress = self.progress;
         progress.step += 1;
         let mut sum: Option<Gradients> = None;
         let mut loss = 0.0;
-        let mut modalities = vec![None; self.model.spec().modalities.len()];
-        for _ in 0..micro_batches {
-            let batch = next()?;
+        let mut parts: Vec<(String, f64, f64)> = Vec::new();
+        let mut traces = Vec::new();
+        let samples: usize = self.micro_batches.iter().sum();
+        for (index, size) in self.micro_batches.iter().enumerate() {
+            let batch = next(index)?;
             // The loss of a step is the mean over its micro-batches, as in the reference.
-            let share = batch.samples() as f64 / self.batch as f64;
-            progress.samples += batch.samples() as u64;
-            progress.input_tokens += batch.visible.sequence.len() as u64;
-            progress.target_tokens += batch.targets.sequence.len() as u64;
-
-            let (values, gradients) = self.gradients(&batch, share);
-            if !values.total.is_finite() {
-                return Err(TrainingError::Loss {
-                    step: progress.step,
-                    loss: values.total,
-                });
+            let share = *size as f64 / samples as f64;
+            let micro = self.objective.micro_step(&batch, share)?;
+            progress.samples += micro.used.samples;
+            progress.input_tokens += micro.used.input_tokens;
+            progress.target_tokens += micro.used.target_tokens;
+            if !micro.loss.is_finite() {
+                let (step, loss) = (progress.step, micro.loss);
+                return Err(TrainingError::Loss { step, loss }.into());
             }
-            loss += values.total * share;
-            add(&mut modalities, &values);
+            loss += micro.loss * share;
+            add(&mut parts, micro.parts);
+            traces.push(micro.trace);
             // A batch that asks for nothing has no gradient.
-            if let Some(gradients) = gradients {
+            if let Some(gradients) = micro.gradients {
                 sum = Some(match sum {
                     Some(sum) => sum.plus(gradients),
                     None => gradients,
@@ -129,38 +236,63 @@ impl Trainer {
             }
         }
         let learning_rate = self.schedule.rate(self.progress.step);
+        // The one place where the gradient of a whole step is at hand: shares are of the step's samples, so that gradients of
+        // several processes are to be added here, and nothing else of a step knows how many there are.
         let mut gradients = sum.unwrap_or_default();
-        gradients.complete(&self.model);
+        gradients.complete(self.objective.module());
         let gradient_norm = self
             .optimizer
-            .step(&mut self.model, gradients, learning_rate)?;
+            .step(self.objective.module_mut(), gradients, learning_rate)
+            .map_err(TrainingError::from)?;
+        let further = self.objective.finish_step(traces, self.progress.step);
         self.progress = progress;
+        let parts = parts.into_iter().map(|(name, mean, _)| (name, mean));
         Ok(StepReport {
             step: progress.step,
             loss,
-            modalities,
+            parts: parts.chain(further).collect(),
             learning_rate,
             gradient_norm,
             progress,
         })
     }
 
-    /// The losses of a batch, and the gradients of `share` times their total, if it has any.
-    fn gradients(&self, batch: &Batch, share: f64) -> (LossValues, Option<Gradients>) {
-        if self.activation_checkpointing {
-            return self.model.recomputed(batch, self.loss, share);
+    /// Takes note of held-out losses; where the best weights are to be kept, these are if they are better.
+    pub fn note(&mut self, held_out: HeldOut) {
+        let best = self.best.as_ref().and_then(|best| best.held_out.mean());
+        let better = held_out
+            .mean()
+            .is_some_and(|mean| best.is_none_or(|best| mean < best));
+        if self.keep == Keep::Best && better {
+            self.best = Some(Best {
+                held_out,
+                weights: self.objective.module().weights(),
+            });
         }
-        let losses = self.model.losses(batch, self.loss);
-        let values = losses.values();
-        let total = losses.total.filter(|_| values.total.is_finite());
-        let gradients = total.map(|total| Gradients::of(&(total * share), &self.model));
-        (values, gradients)
     }
 
-    /// The model.
+    /// Puts the best weights back, where they were to be kept, and says which they are.
+    ///
+    /// # Errors
+    /// When they are not those of the module: a damaged checkpoint.
+    pub fn finish(&mut self) -> Result<Option<HeldOut>, TrainingError> {
+        let Some(best) = self.best.take() else {
+            return Ok(None);
+        };
+        self.objective.module_mut().load(&best.weights)?;
+        Ok(Some(best.held_out))
+    }
+
+    /// What is trained.
     #[must_use]
-    pub fn model(&self) -> &Mget {
-        &self.model
+    pub fn objective(&self) -> &O {
+        &self.objective
+    }
+
+    /// The module in training.
+    #[must_use]
+    pub fn model(&self) -> &O::Module {
+        self.objective.module()
     }
 
     /// Totals so far.
@@ -175,16 +307,30 @@ impl Trainer {
         self.schedule.total()
     }
 
-    /// Writes weights, moments and progress into an empty directory.
+    /// Samples of each forward pass of a step.
+    #[must_use]
+    pub fn micro_batches(&self) -> &[usize] {
+        &self.micro_batches
+    }
+
+    /// Writes everything that the next step depends on, besides settings, seed and data, into an empty directory.
     ///
     /// # Errors
     /// When a file cannot be written.
     pub fn save(&self, directory: &Path) -> Result<(), TrainingError> {
-        self.model.weights().write(&directory.join(WEIGHTS))?;
+        let weights = self.objective.module().weights();
+        weights.write(&directory.join(WEIGHTS))?;
         self.optimizer.state().write(&directory.join(OPTIMIZER))?;
+        if let Some(best) = &self.best {
+            let path = directory.join(BEST);
+            let text = serde_json::to_string(&best.held_out).map_err(|e| damaged(&path, &e))?;
+            let mut weights = best.weights.clone();
+            weights.metadata.insert(HELD_OUT.to_owned(), text);
+            weights.write(&path)?;
+        }
         let path = directory.join(PROGRESS);
         let text =
-            serde_json::to_vec_pretty(&self.progress).map_err(|error| checkpoint(&path, &error))?;
+            serde_json::to_vec_pretty(&self.progress).map_err(|error| damaged(&path, &error))?;
         std::fs::write(&path, text).map_err(|error| TrainingError::Write { path, error })
     }
 
@@ -194,38 +340,52 @@ impl Trainer {
     /// When the directory is damaged or of another model.
     pub fn resume(&mut self, directory: &Path) -> Result<(), TrainingError> {
         let path = directory.join(PROGRESS);
-        let text = std::fs::read(&path).map_err(|error| checkpoint(&path, &error))?;
+        let text = std::fs::read(&path).map_err(|error| damaged(&path, &error))?;
         let progress: Progress =
-            serde_json::from_slice(&text).map_err(|error| checkpoint(&path, &error))?;
+            serde_json::from_slice(&text).map_err(|error| damaged(&path, &error))?;
+        let path = directory.join(BEST);
+        let best = if self.keep == Keep::Best && path.is_file() {
+            let mut weights = Weights::read(&path)?;
+            let text = weights.metadata.remove(HELD_OUT).unwrap_or_default();
+            let held_out = serde_json::from_str(&text).map_err(|error| damaged(&path, &error))?;
+            self.objective.module().check_shapes(&weights)?;
+            Some(Best { held_out, weights })
+        } else {
+            None
+        };
         let weights = Weights::read(&directory.join(WEIGHTS))?;
         self.optimizer
             .restore(&Weights::read(&directory.join(OPTIMIZER))?)?;
-        self.model.load(&weights)?;
+        self.objective.module_mut().load(&weights)?;
         self.progress = progress;
+        self.best = best;
         Ok(())
     }
 }
 
 const WEIGHTS: &str = "weights.safetensors";
 const OPTIMIZER: &str = "optimizer.safetensors";
+const BEST: &str = "best.safetensors";
 const PROGRESS: &str = "progress.json";
+/// The key of the held-out losses in the metadata of [`BEST`].
+const HELD_OUT: &str = "held_out";
 
-fn checkpoint(path: &Path, reason: &dyn std::fmt::Display) -> TrainingError {
+fn damaged(path: &Path, reason: &dyn std::fmt::Display) -> TrainingError {
     TrainingError::Checkpoint {
         path: path.to_path_buf(),
         reason: reason.to_string(),
     }
 }
 
-/// Adds means over tokens of another micro-batch.
-fn add(sums: &mut [Option<(f64, usize)>], values: &LossValues) {
-    for (sum, value) in sums.iter_mut().zip(&values.modalities) {
-        *sum = match (*sum, *value) {
-            (Some((a, n)), Some((b, m))) => {
-                let (wa, wb) = (n as f64, m as f64);
-                Some(((a * wa + b * wb) / (wa + wb), n + m))
+/// Adds weighted means of another micro-batch.
+fn add(sums: &mut Vec<(String, f64, f64)>, parts: Vec<(String, f64, f64)>) {
+    for (name, mean, weight) in parts {
+        match sums.iter_mut().find(|sum| sum.0 == name) {
+            Some((_, a, wa)) => {
+                *a = (*a * *wa + mean * weight) / (*wa + weight);
+                *wa += weight;
             }
-            (sum, value) => sum.or(value),
-        };
+            None => sums.push((name, mean, weight)),
+        }
     }
 }

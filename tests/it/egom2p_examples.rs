@@ -12,7 +12,8 @@ use reviv::tokenizer::Tokenizer;
 use reviv::tokenizer::normaliser::Normaliser;
 use reviv::tokenizer::trained::{VqTokenizer, prepare};
 use reviv::tokenizer::vq::{VqSettings, VqVae};
-use reviv::training::tokenizer::{TokenizerTraining, Trainer};
+use reviv::training::tokenizer::{Epochs, TokenizerTraining};
+use reviv::training::{Trainer, TrainingError};
 
 const SAMPLES: usize = 60;
 
@@ -113,13 +114,18 @@ fn errors(modality: &str, clip: &Signal, normaliser: Option<Normaliser>) -> (f64
     let settings = TokenizerTraining {
         steps: 150,
         batch: 8,
-        rate: 2e-3,
+        learning_rate: 2e-3,
         warmup: 10,
         ..TokenizerTraining::default()
     };
-    let mut trainer = Trainer::new(model, &settings, 0).unwrap();
-    while !trainer.finished() {
-        trainer.step(&data).unwrap();
+    let mut trainer = Trainer::vq(model, &settings, 0).unwrap();
+    let mut epochs = Epochs::of(&trainer, 0);
+    for step in 0..trainer.total_steps() {
+        let next = |micro| -> Result<_, TrainingError> {
+            let chosen = epochs.choose(step, micro, data.len())?;
+            Ok(chosen.into_iter().map(|i| data[i].clone()).collect())
+        };
+        trainer.step(next).unwrap();
     }
     let tokenizer = VqTokenizer::new(modality, shape, normaliser, trainer.model()).unwrap();
     let tokens = tokenizer.encode(std::slice::from_ref(clip)).unwrap();

@@ -7,8 +7,8 @@ use reviv::mget::{Mget, MgetSpec, ModalitySpec, Positions, Size};
 use reviv::random::stream;
 use reviv::tokenizer::TokenGrid;
 use reviv::training::{
-    BatchSource, DataError, DatasetSize, InMemory, Loader, Sampler, TokenSample, TokenSource,
-    Trainer, TrainingError, TrainingSettings, Unigram, Validation,
+    BatchSource, DataError, DatasetSize, InMemory, Loader, MaskedPrediction, Sampler, TokenSample,
+    TokenSource, Trainer, TrainingError, TrainingSettings, Unigram, Validation,
 };
 use std::ops::Range;
 use std::sync::Arc;
@@ -91,7 +91,7 @@ impl Setup {
         Masking::new(&settings, &spec().slots()).unwrap()
     }
 
-    fn trainer(&self) -> Trainer {
+    fn trainer(&self) -> Trainer<MaskedPrediction> {
         let compute = Compute::cpu();
         let model = Mget::new(&spec(), &Initialise::new(&compute, 7)).unwrap();
         let measure = DatasetSize {
@@ -117,20 +117,22 @@ impl Setup {
         })
     }
 
-    fn run(&self, trainer: &mut Trainer, steps: Range<u64>) -> Result<Vec<f64>, TrainingError> {
+    fn run(
+        &self,
+        trainer: &mut Trainer<MaskedPrediction>,
+        steps: Range<u64>,
+    ) -> Result<Vec<f64>, TrainingError> {
         let mut loader = Loader::start(
             &self.feed(),
             steps.start..self.steps,
             self.settings.loader_threads,
         );
-        let micro_batches = self.settings.micro_batches().len();
-        steps
-            .map(|_| Ok(trainer.step(micro_batches, || loader.next(&|| 0.0))?.loss))
-            .collect()
+        let mut next = |_| Ok::<_, TrainingError>(loader.next(&|| 0.0)?);
+        steps.map(|_| Ok(trainer.step(&mut next)?.loss)).collect()
     }
 }
 
-fn bytes(trainer: &Trainer) -> Vec<u8> {
+fn bytes(trainer: &Trainer<MaskedPrediction>) -> Vec<u8> {
     let directory = tempfile::tempdir().unwrap();
     trainer.save(directory.path()).unwrap();
     let mut bytes = Vec::new();

@@ -11,10 +11,12 @@ use crate::run::checkpoint;
 use crate::run::environment::Stopwatch;
 use crate::run::files::copy_tree;
 use crate::training::{
-    BatchSource, DataError, Loader, Sampler, Score, Shards, StepReport, TokenSource, Trainer,
-    TrainingError, TrainingSettings, Unigram, Validation,
+    BatchSource, DataError, Event, Flow, HeldOut, Intervals, Keep, Loader, MaskedPrediction,
+    Objective, Progress, Sampler, Score, Shards, StepReport, TokenSource, Trainer, TrainingError,
+    TrainingSettings, Unigram, Validation, fit,
 };
 use serde_json::{Value, json};
+use std::cell::RefCell;
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::sync::Arc;
@@ -48,9 +50,36 @@ fn input_error(error: impl Into<TrainingError>) -> StageError {
     }
 }
 
+/// Why training ended early.
+enum Failure {
+    Training(TrainingError),
+    Stage(StageError),
+}
+
+impl From<TrainingError> for Failure {
+    fn from(error: TrainingError) -> Self {
+        Self::Training(error)
+    }
+}
+
+impl From<StageError> for Failure {
+    fn from(error: StageError) -> Self {
+        Self::Stage(error)
+    }
+}
+
+impl From<Failure> for StageError {
+    fn from(failure: Failure) -> Self {
+        match failure {
+            Failure::Training(error) => input_error(error),
+            Failure::Stage(error) => error,
+        }
+    }
+}
+
 /// A stage under way.
 pub(super) struct Run {
-    trainer: Trainer,
+    trainer: Trainer<MaskedPrediction>,
     feed: Arc<BatchSource>,
     validation: Validation,
     baseline: BTreeMap<String, Score>,
@@ -154,138 +183,60 @@ impl Run {
 
     pub(super) fn train(mut self, context: &mut dyn StageContext) -> Result<Value, StageError> {
         let total = self.trainer.total_steps();
-        let start = self.trainer.progress().step;
-        let mut loader = Loader::start(&self.feed, start..total, self.settings.loader_threads);
+        let start = self.trainer.progress();
+        if context.interrupted() && start.step < total {
+            save(&self.trainer, context)?;
+            return Err(StageError::Interrupted);
+        }
+        let loader = Loader::start(&self.feed, start.step..total, self.settings.loader_threads);
+        let loader = RefCell::new(loader);
         let watch = Stopwatch::start();
-        let mut seconds = 0.0;
-        while self.trainer.progress().step < total {
-            if context.interrupted() {
-                self.save(context)?;
-                return Err(StageError::Interrupted);
-            }
-            let before = self.trainer.progress();
-            let report = self
-                .trainer
-                .step(self.feed.micro_batches.len(), || {
-                    loader.next(&|| watch.seconds())
-                })
-                .map_err(input_error)?;
-            let tokens = report.progress.input_tokens + report.progress.target_tokens
-                - before.input_tokens
-                - before.target_tokens;
-            let rate = tokens as f64 / (watch.seconds() - seconds).max(1e-9);
-            seconds = watch.seconds();
-            self.record(context, &report, rate)?;
-            context.progress(report.step, total, "steps");
-            let every = |interval: u64| {
-                interval > 0 && report.step.is_multiple_of(interval) && report.step < total
-            };
-            if every(self.settings.validate_every) {
-                self.validate(context)?;
-            }
-            if every(self.settings.checkpoint_every) {
-                self.save(context)?;
-            }
-        }
-        if watch.seconds() > 0.0 && start < total {
-            let share = loader.waited() / watch.seconds();
-            context.log(&format!(
-                "{:.1}% of the time was spent waiting for data",
-                100.0 * share
-            ));
-            context.record(total, &[("data/wait_share", share)])?;
-        }
-        drop(loader);
-        let scores = self.validate(context)?;
-        self.publish(context, &scores)
-    }
-
-    fn save(&self, context: &mut dyn StageContext) -> Result<(), StageError> {
-        let step = self.trainer.progress().step;
-        checkpoint::save(context, step, |_, directory| {
-            self.trainer.save(directory).map_err(StageError::other)
-        })
-    }
-
-    fn record(
-        &self,
-        context: &mut dyn StageContext,
-        report: &StepReport,
-        rate: f64,
-    ) -> Result<(), StageError> {
-        let names: Vec<String> = self
-            .feed
-            .spec
-            .modalities
-            .iter()
-            .map(|m| format!("loss/{}", m.name))
-            .collect();
+        let mut last = (start, 0.0);
+        let (validation, baseline) = (&self.validation, &self.baseline);
         let (input, target) = self.masking.nominal_tokens();
-        let nominal = report.progress.samples as f64 * (input + target) as f64;
-        let real = (report.progress.input_tokens + report.progress.target_tokens) as f64;
-        let mut scalars = vec![
-            ("loss", report.loss),
-            ("learning_rate", report.learning_rate),
-            ("gradient_norm", report.gradient_norm),
-            ("tokens/nominal", nominal),
-            ("tokens/real", real),
-            ("tokens/per_second", rate),
-        ];
-        for (name, loss) in names.iter().zip(&report.modalities) {
-            if let Some((loss, _)) = loss {
-                scalars.push((name, *loss));
-            }
+        let fitted = fit(
+            &mut self.trainer,
+            Intervals {
+                validate_every: self.settings.validate_every,
+                checkpoint_every: self.settings.checkpoint_every,
+            },
+            |_, _| -> Result<_, Failure> {
+                let batch = loader.borrow_mut().next(&|| watch.seconds());
+                Ok(batch.map_err(TrainingError::from)?)
+            },
+            |objective| Ok(validation.run(objective.module())),
+            |event| {
+                match event {
+                    Event::Step { report, total } => {
+                        let tokens = real(report.progress) - real(last.0);
+                        let rate = tokens as f64 / (watch.seconds() - last.1).max(1e-9);
+                        last = (report.progress, watch.seconds());
+                        record(context, report, input + target, rate)?;
+                        context.progress(report.step, total, "steps");
+                        if report.step == total {
+                            waited(context, total, loader.borrow().waited() / watch.seconds())?;
+                        }
+                    }
+                    Event::Validation(held_out) => held_out_losses(context, held_out, baseline)?,
+                    Event::Checkpoint(trainer) => save(trainer, context)?,
+                }
+                let stop = context.interrupted();
+                Ok(if stop { Flow::Stop } else { Flow::Continue })
+            },
+        )?;
+        drop(loader);
+        if fitted.flow == Flow::Stop {
+            return Err(StageError::Interrupted);
         }
-        context.record(report.step, &scalars)
-    }
-
-    fn validate(
-        &self,
-        context: &mut dyn StageContext,
-    ) -> Result<BTreeMap<String, Score>, StageError> {
-        let scores = self.validation.run(self.trainer.model());
-        let step = self.trainer.progress().step;
-        let mut scalars = Vec::new();
-        for (name, score) in &scores {
-            scalars.push((format!("validation/{name}"), score.loss));
-            scalars.push((format!("unigram/{name}"), self.unigram(name)));
-        }
-        if !scores.is_empty() {
-            let mean = scores.values().map(|score| score.loss).sum::<f64>() / scores.len() as f64;
-            scalars.push(("validation/mean".to_owned(), mean));
-            let scalars: Vec<(&str, f64)> = scalars
-                .iter()
-                .map(|(name, value)| (name.as_str(), *value))
-                .collect();
-            context.record(step, &scalars)?;
-            context.record_text(step, "validation", &self.table(&scores))?;
-        }
-        Ok(scores)
-    }
-
-    /// The held-out loss that token frequencies alone give.
-    fn unigram(&self, modality: &str) -> f64 {
-        let baseline = self.baseline.get(modality);
-        baseline.map_or(f64::NAN, |score| score.loss)
-    }
-
-    /// Held-out losses beside the baseline, as Markdown.
-    fn table(&self, scores: &BTreeMap<String, Score>) -> String {
-        let mut text = String::from(
-            "| modality | held-out loss (nats) | token frequencies alone | tokens |\n|---|---:|---:|---:|\n",
-        );
-        for (name, Score { loss, tokens }) in scores {
-            let unigram = self.unigram(name);
-            let _ = writeln!(text, "| {name} | {loss:.4} | {unigram:.4} | {tokens} |");
-        }
-        text
+        self.publish(context, &fitted.held_out)
     }
 
     fn publish(
         self,
         context: &mut dyn StageContext,
-        scores: &BTreeMap<String, Score>,
+        held_out: &HeldOut,
     ) -> Result<Value, StageError> {
+        let scores = &held_out.scores;
         let output = context.output().to_path_buf();
         self.trainer
             .model()
@@ -297,7 +248,7 @@ impl Run {
         let report = output.join("report");
         std::fs::create_dir_all(&report).map_err(StageError::io(&report))?;
         let path = report.join("validation.md");
-        std::fs::write(&path, self.table(scores)).map_err(StageError::io(&path))?;
+        std::fs::write(&path, table(scores, &self.baseline)).map_err(StageError::io(&path))?;
         if let Some(tokenizers) = &self.tokenizers {
             copy_tree(tokenizers, &output.join(TOKENIZERS)).map_err(StageError::other)?;
         }
@@ -305,14 +256,103 @@ impl Run {
             let binding = ModelManifest::of(&output, clips).map_err(StageError::other)?;
             binding.write(&output).map_err(StageError::other)?;
         }
-        Ok(json!({
+        let mut made = json!({
             "mget": self.feed.spec,
             "parameters": self.feed.spec.parameter_count(),
             "progress": self.trainer.progress(),
             "validation": scores,
             "unigram": self.baseline,
-        }))
+        });
+        if self.settings.keep == Keep::Best {
+            made["best_step"] = json!(held_out.step);
+        }
+        Ok(made)
     }
+}
+
+fn save(
+    trainer: &Trainer<MaskedPrediction>,
+    context: &mut dyn StageContext,
+) -> Result<(), StageError> {
+    checkpoint::save(context, trainer.progress().step, |_, directory| {
+        trainer.save(directory).map_err(StageError::other)
+    })
+}
+
+/// Tokens that were there.
+fn real(progress: Progress) -> u64 {
+    progress.input_tokens + progress.target_tokens
+}
+
+/// Records a step.
+fn record(
+    context: &mut dyn StageContext,
+    report: &StepReport,
+    nominal: usize,
+    rate: f64,
+) -> Result<(), StageError> {
+    let mut scalars = report.scalars();
+    scalars.extend([
+        (
+            "tokens/nominal",
+            report.progress.samples as f64 * nominal as f64,
+        ),
+        ("tokens/real", real(report.progress) as f64),
+        ("tokens/per_second", rate),
+    ]);
+    context.record(report.step, &scalars)
+}
+
+fn waited(context: &mut dyn StageContext, step: u64, share: f64) -> Result<(), StageError> {
+    context.log(&format!(
+        "{:.1}% of the time was spent waiting for data",
+        100.0 * share
+    ));
+    context.record(step, &[("data/wait_share", share)])
+}
+
+fn held_out_losses(
+    context: &mut dyn StageContext,
+    held_out: &HeldOut,
+    baseline: &BTreeMap<String, Score>,
+) -> Result<(), StageError> {
+    let mut scalars = Vec::new();
+    for (name, score) in &held_out.scores {
+        scalars.push((format!("validation/{name}"), score.loss));
+        scalars.push((format!("unigram/{name}"), unigram(baseline, name)));
+    }
+    scalars.extend(
+        held_out
+            .mean()
+            .map(|mean| ("validation/mean".to_owned(), mean)),
+    );
+    let scalars: Vec<(&str, f64)> = scalars
+        .iter()
+        .map(|(name, value)| (name.as_str(), *value))
+        .collect();
+    context.record(held_out.step, &scalars)?;
+    context.record_text(
+        held_out.step,
+        "validation",
+        &table(&held_out.scores, baseline),
+    )
+}
+
+/// The held-out loss that token frequencies alone give.
+fn unigram(baseline: &BTreeMap<String, Score>, modality: &str) -> f64 {
+    baseline.get(modality).map_or(f64::NAN, |score| score.loss)
+}
+
+/// Held-out losses beside the baseline, as Markdown.
+fn table(scores: &BTreeMap<String, Score>, baseline: &BTreeMap<String, Score>) -> String {
+    let mut text = String::from(
+        "| modality | held-out loss (nats) | token frequencies alone | tokens |\n|---|---:|---:|---:|\n",
+    );
+    for (name, Score { loss, tokens }) in scores {
+        let unigram = unigram(baseline, name);
+        let _ = writeln!(text, "| {name} | {loss:.4} | {unigram:.4} | {tokens} |");
+    }
+    text
 }
 
 /// Refuses token sets of other tokenizers than the first one's: the same numbers would mean other signals, in grids that fit.

@@ -8,25 +8,25 @@ use super::scores::{Baselines, Scores, score};
 use super::{TrainTokenizerSettings, compute, report, tokens};
 use crate::clip::Signal;
 use crate::clip::store::ClipSet;
-use crate::engine::{Initialise, Parameters, Weights};
+use crate::engine::{Initialise, Parameters};
 use crate::experiment::{Code, StageContext, StageError};
 use crate::modality::declared::Normalize;
 use crate::modality::{ClipFormat, Modality, Shape};
 use crate::run::checkpoint;
 use crate::tokenizer::normaliser::Normaliser;
-use crate::tokenizer::trained::{Prepared, VqTokenizer, batch, prepare};
+use crate::tokenizer::trained::{VqTokenizer, batch, prepare};
 use crate::tokenizer::video::{Network, VideoSettings, VideoTokenizer};
 use crate::tokenizer::vq::{VqSettings, VqVae};
 use crate::tokenizer::{Tokenizer, TokenizerError};
 use crate::training::kmeans::KMeans;
-use crate::training::tokenizer::{Trainer, TrainingError, mirrored};
+use crate::training::tokenizer::{Epochs, mirrored};
 use crate::training::video_kmeans::VideoKMeans;
-use crate::training::video_tokenizer::VideoTrainer;
+use crate::training::{
+    Event, Flow, Intervals, Keep, Objective, Score, Trainer, TrainingError, fit,
+};
 use serde_json::{Value, json};
+use std::collections::BTreeMap;
 use std::path::Path;
-
-/// The file of a checkpoint.
-const STATE: &str = "state.safetensors";
 
 /// Clips read at a time.
 const CHUNK: usize = 256;
@@ -137,22 +137,35 @@ fn train_vq(
         let batches: Vec<_> = first.chunks(16).map(|part| batch(&model, part)).collect();
         model.calibrate(&batches).map_err(StageError::other)?;
     }
-    let trainer = Trainer::new(
+    let held_out = match &data.validation {
+        Some(set) if settings.validates() => {
+            let most = settings.validation_clips.min(set.len());
+            let found = extract(set, modality, &[], 0..most)?;
+            let signals: Vec<Signal> = found.into_iter().map(|found| found.signal).collect();
+            prepare(&settings.modality, &model, &normaliser, &signals)
+                .map_err(|error| damaged(&error.to_string()))?
+        }
+        _ => Vec::new(),
+    };
+    let mut trainer = Trainer::vq(
         model,
         &settings.training(prepared.len() as u64),
         context.seed(),
     )
     .map_err(|error| failed(error, settings))?;
-    let mut training = VqTraining {
-        trainer,
-        data: &prepared,
-    };
-    train(&mut training, settings, context)?;
+    train(
+        &mut trainer,
+        settings,
+        context,
+        |chosen| Ok(chosen.iter().map(|i| prepared[*i].clone()).collect()),
+        |objective| Ok(objective.held_out(&held_out)),
+        prepared.len(),
+    )?;
     let tokenizer = VqTokenizer::new(
         &settings.modality,
         shape,
         normaliser.clone(),
-        training.trainer.model(),
+        trainer.model(),
     )
     .map_err(StageError::other)?;
     tokenizer
@@ -226,19 +239,32 @@ fn train_video(
         }
         model.calibrate(&first).map_err(StageError::other)?;
     }
-    let trainer = VideoTrainer::new(
-        model,
-        &settings.training(having.len() as u64),
-        context.seed(),
-    )
-    .map_err(|error| failed(error, settings))?;
-    let mut training = VideoTraining {
-        trainer,
-        data,
-        having: &having,
+    let held_out = match &data.validation {
+        Some(set) if settings.validates() => settings.validation_clips.min(set.len()),
+        _ => 0,
     };
-    train(&mut training, settings, context)?;
-    let tokenizer = training.trainer.tokenizer();
+    let mut trainer = Trainer::video(model, &settings.training(having.len() as u64))
+        .map_err(|error| failed(error, settings))?;
+    train(
+        &mut trainer,
+        settings,
+        context,
+        |chosen| {
+            let found = chosen.iter().map(|index| read(*index));
+            let found: Result<Vec<_>, StageError> = found.collect();
+            Ok(found?.into_iter().flatten().collect())
+        },
+        |objective| {
+            let clips = (0..held_out).map(|index| {
+                let set = data.validation.as_ref().ok_or(TrainingError::NoData)?;
+                let found = extract(set, modality, &[], index..index + 1)?;
+                Ok(found.into_iter().next().map(|found| found.signal))
+            });
+            objective.held_out(clips)
+        },
+        having.len(),
+    )?;
+    let tokenizer = trainer.objective().tokenizer();
     tokenizer
         .write(context.output())
         .map_err(StageError::other)?;
@@ -342,15 +368,7 @@ fn hold_out(
     )
 }
 
-/// What both families have in common between two steps.
-trait Training {
-    fn steps(&self) -> u64;
-    /// Takes a step and says what to record.
-    fn step(&mut self) -> Result<Vec<(&'static str, f64)>, Failure>;
-    fn checkpoint(&self) -> Weights;
-    fn restore(&mut self, state: &Weights) -> Result<(), TrainingError>;
-}
-
+/// Why training ended early.
 enum Failure {
     Training(TrainingError),
     Stage(StageError),
@@ -362,126 +380,82 @@ impl From<TrainingError> for Failure {
     }
 }
 
-struct VqTraining<'a> {
-    trainer: Trainer,
-    data: &'a [Prepared],
-}
-
-impl Training for VqTraining<'_> {
-    fn steps(&self) -> u64 {
-        self.trainer.steps()
-    }
-
-    fn step(&mut self) -> Result<Vec<(&'static str, f64)>, Failure> {
-        let report = self.trainer.step(self.data)?;
-        Ok(vec![
-            ("loss", report.loss),
-            ("loss/reconstruction", report.reconstruction),
-            ("loss/commitment", report.commitment),
-            ("gradient_norm", report.gradient_norm),
-            ("learning_rate", report.rate),
-            ("codes/replaced", report.replaced as f64),
-        ])
-    }
-
-    fn checkpoint(&self) -> Weights {
-        self.trainer.checkpoint()
-    }
-
-    fn restore(&mut self, state: &Weights) -> Result<(), TrainingError> {
-        self.trainer.restore(state)
+impl From<StageError> for Failure {
+    fn from(error: StageError) -> Self {
+        Self::Stage(error)
     }
 }
 
-struct VideoTraining<'a> {
-    trainer: VideoTrainer,
-    data: &'a Data,
-    having: &'a [usize],
-}
-
-impl Training for VideoTraining<'_> {
-    fn steps(&self) -> u64 {
-        self.trainer.steps()
-    }
-
-    fn step(&mut self) -> Result<Vec<(&'static str, f64)>, Failure> {
-        if self.having.is_empty() {
-            return Err(TrainingError::NoData.into());
-        }
-        let mut clips = Vec::new();
-        for choice in self.trainer.choose(self.having.len()) {
-            let index = self.having[choice];
-            let modality = self.data.modality.as_ref();
-            let found = extract(&self.data.train, modality, &[], index..index + 1)
-                .map_err(Failure::Stage)?;
-            clips.extend(found.into_iter().map(|found| found.signal));
-        }
-        let report = self.trainer.step(&clips)?;
-        Ok(vec![
-            ("loss", report.loss),
-            ("gradient_norm", report.gradient_norm),
-            ("learning_rate", report.rate),
-        ])
-    }
-
-    fn checkpoint(&self) -> Weights {
-        self.trainer.checkpoint()
-    }
-
-    fn restore(&mut self, state: &Weights) -> Result<(), TrainingError> {
-        self.trainer.restore(state)
-    }
-}
-
-/// The loop: continues from the last checkpoint, and leaves one when interrupted.
-fn train(
-    training: &mut dyn Training,
+/// Trains from the last checkpoint on, and leaves one when interrupted.
+fn train<O: Objective>(
+    trainer: &mut Trainer<O>,
     settings: &TrainTokenizerSettings,
     context: &mut dyn StageContext,
+    mut batch: impl FnMut(&[usize]) -> Result<O::Batch, StageError>,
+    validate: impl FnMut(&O) -> Result<BTreeMap<String, Score>, Failure>,
+    signals: usize,
 ) -> Result<(), StageError> {
     if let Some((step, path)) = checkpoint::latest(context.checkpoints()) {
-        let state = Weights::read(&path.join(STATE)).map_err(StageError::other)?;
-        training.restore(&state).map_err(StageError::other)?;
+        trainer.resume(&path).map_err(StageError::other)?;
         context.log(&format!("continues from step {step}"));
     }
-    while training.steps() < settings.steps {
-        if context.interrupted() {
-            save(training, context)?;
-            return Err(StageError::Interrupted);
-        }
-        let scalars = training.step().map_err(|failure| match failure {
-            Failure::Training(error) => failed(error, settings),
-            Failure::Stage(error) => error,
-        })?;
-        let step = training.steps();
-        context.record(step, &scalars)?;
-        context.progress(step, settings.steps, "steps");
-        let every = settings.checkpoint_every;
-        if every > 0 && step.is_multiple_of(every) && step < settings.steps {
-            save(training, context)?;
-        }
+    let save = |trainer: &Trainer<O>, context: &mut dyn StageContext| {
+        checkpoint::save(context, trainer.progress().step, |_, folder: &Path| {
+            trainer.save(folder).map_err(StageError::other)
+        })
+    };
+    if context.interrupted() && trainer.progress().step < trainer.total_steps() {
+        save(trainer, context)?;
+        return Err(StageError::Interrupted);
     }
-    Ok(())
-}
-
-fn save(training: &dyn Training, context: &mut dyn StageContext) -> Result<(), StageError> {
-    checkpoint::save(context, training.steps(), |_, folder: &Path| {
-        training
-            .checkpoint()
-            .write(&folder.join(STATE))
-            .map_err(StageError::other)
-    })
+    let mut epochs = Epochs::of(trainer, context.seed());
+    let fitted = fit(
+        trainer,
+        Intervals {
+            validate_every: settings.validate_every,
+            checkpoint_every: settings.checkpoint_every,
+        },
+        |step, micro| Ok::<_, Failure>(batch(&epochs.choose(step, micro, signals)?)?),
+        validate,
+        |event| {
+            match event {
+                Event::Step { report, total } => {
+                    context.record(report.step, &report.scalars())?;
+                    context.progress(report.step, total, "steps");
+                }
+                Event::Validation(held_out) => {
+                    let loss = held_out.mean().map(|mean| ("validation/loss", mean));
+                    context.record(held_out.step, loss.as_slice())?;
+                }
+                Event::Checkpoint(trainer) => save(trainer, context)?,
+            }
+            let stop = context.interrupted();
+            Ok(if stop { Flow::Stop } else { Flow::Continue })
+        },
+    )
+    .map_err(|failure| match failure {
+        Failure::Training(error) => failed(error, settings),
+        Failure::Stage(error) => error,
+    })?;
+    if settings.keep == Keep::Best {
+        context.log(&format!(
+            "keeps the weights of step {}",
+            fitted.held_out.step
+        ));
+    }
+    match fitted.flow {
+        Flow::Continue => Ok(()),
+        Flow::Stop => Err(StageError::Interrupted),
+    }
 }
 
 fn failed(error: TrainingError, settings: &TrainTokenizerSettings) -> StageError {
     match error {
-        error @ (TrainingError::NotFinite { .. } | TrainingError::Gradient(_)) => {
-            StageError::Input {
-                code: Code::E0206,
-                message: error.to_string(),
-                help: format!("try a `learning_rate` below {}", settings.learning_rate),
-            }
-        }
+        error @ (TrainingError::Loss { .. } | TrainingError::Gradient(_)) => StageError::Input {
+            code: Code::E0206,
+            message: error.to_string(),
+            help: format!("try a `learning_rate` below {}", settings.learning_rate),
+        },
         TrainingError::NoData => StageError::Input {
             code: Code::E0401,
             message: format!("no training clip has the modality `{}`", settings.modality),

@@ -1,0 +1,85 @@
+//! Training MGET (Sec. 4.3, Supp. B): the masked prediction of tokens as an [`Objective`].
+
+use super::schedule::Schedule;
+use super::settings::TrainingSettings;
+use super::trainer::{MicroStep, Objective, Progress, Trainer, TrainingError};
+use crate::engine::Gradients;
+use crate::mget::{Batch, Loss, LossValues, Mget};
+
+/// MGET, trained to predict target tokens from input tokens and raw video.
+#[derive(Debug, Clone)]
+pub struct MaskedPrediction {
+    model: Mget,
+    loss: Loss,
+    activation_checkpointing: bool,
+}
+
+impl Trainer<MaskedPrediction> {
+    /// Starts to train `model`.
+    #[must_use]
+    pub fn new(model: Mget, settings: &TrainingSettings, schedule: Schedule) -> Self {
+        let objective = MaskedPrediction {
+            model,
+            loss: settings.loss,
+            activation_checkpointing: settings.activation_checkpointing,
+        };
+        Self::start(
+            objective,
+            settings.optimizer.clone(),
+            schedule,
+            settings.micro_batches(),
+            settings.keep,
+        )
+    }
+}
+
+impl MaskedPrediction {
+    /// The losses of a batch, and the gradients of `share` times their total, if it has any.
+    fn gradients(&self, batch: &Batch, share: f64) -> (LossValues, Option<Gradients>) {
+        if self.activation_checkpointing {
+            return self.model.recomputed(batch, self.loss, share);
+        }
+        let losses = self.model.losses(batch, self.loss);
+        let values = losses.values();
+        let total = losses.total.filter(|_| values.total.is_finite());
+        let gradients = total.map(|total| Gradients::of(&(total * share), &self.model));
+        (values, gradients)
+    }
+}
+
+impl Objective for MaskedPrediction {
+    type Module = Mget;
+    type Batch = Batch;
+    type Trace = ();
+
+    fn module(&self) -> &Mget {
+        &self.model
+    }
+
+    fn module_mut(&mut self) -> &mut Mget {
+        &mut self.model
+    }
+
+    fn micro_step(&self, batch: &Batch, share: f64) -> Result<MicroStep<()>, TrainingError> {
+        let (values, gradients) = self.gradients(batch, share);
+        let modalities = self.model.spec().modalities.iter().zip(values.modalities);
+        Ok(MicroStep {
+            loss: values.total,
+            // Nothing where a modality was not asked for.
+            parts: modalities
+                .filter_map(|(modality, loss)| {
+                    let (mean, tokens) = loss?;
+                    Some((format!("loss/{}", modality.name), mean, tokens as f64))
+                })
+                .collect(),
+            gradients,
+            used: Progress {
+                step: 0,
+                samples: batch.samples() as u64,
+                input_tokens: batch.visible.sequence.len() as u64,
+                target_tokens: batch.targets.sequence.len() as u64,
+            },
+            trace: (),
+        })
+    }
+}
