@@ -9,7 +9,7 @@ use serde_json::{Map, Value};
 pub const FAST: &str = include_str!("../../registry/decoding/fast.yaml");
 
 /// Every target by itself, three steps, guidance 2.
-pub const PAPER: &str = include_str!("../../registry/decoding/paper.yaml");
+pub const RELEASE: &str = include_str!("../../registry/decoding/release.yaml");
 
 /// What a registry entry holds besides its name.
 fn settings(entry: &str) -> DecodingSettings {

@@ -68,8 +68,8 @@ enum Case {
     ActivationCheckpointing,
     /// Generation with the preset `fast`.
     DecodingFast,
-    /// Generation with the preset `paper`.
-    DecodingPaper,
+    /// Generation with the preset `release`.
+    DecodingRelease,
 }
 
 impl Case {
@@ -89,8 +89,8 @@ impl Case {
             Self::Packing => "MGET `tiny` (8 samples, at most 512 + 512 tokens)",
             Self::ActivationCheckpointing => "MGET `tiny` (8 samples, 1024 + 1024 tokens)",
             Self::DecodingFast => "decoding `fast` (1 clip: camera, gaze, body from video tokens)",
-            Self::DecodingPaper => {
-                "decoding `paper` (1 clip: camera, gaze, body from video tokens)"
+            Self::DecodingRelease => {
+                "decoding `release` (1 clip: camera, gaze, body from video tokens)"
             }
         }
     }
@@ -101,7 +101,7 @@ impl Case {
             Self::MgetTiny => 5,
             Self::Tokenizer | Self::Packing | Self::DecodingFast => 3,
             Self::Video | Self::MgetBase | Self::ActivationCheckpointing => 2,
-            Self::DecodingPaper => 1,
+            Self::DecodingRelease => 1,
         }
     }
 
@@ -120,7 +120,7 @@ impl Case {
             Self::Packing => mget::packing(meter),
             Self::ActivationCheckpointing => mget::activation_checkpointing(meter),
             Self::DecodingFast => decoding::run(meter, decoding::FAST),
-            Self::DecodingPaper => decoding::run(meter, decoding::PAPER),
+            Self::DecodingRelease => decoding::run(meter, decoding::RELEASE),
         }
     }
 }

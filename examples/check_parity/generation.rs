@@ -100,7 +100,7 @@ fn chained(index: usize, case: &Value, report: &mut Report) {
     let (conditions, targets) = (names(&args["cond_domains"]), names(&args["target_domains"]));
     let mut settings = DecodingSettings {
         order: Order::Chained,
-        hide: Some(conditions.clone()),
+        uncond_drop: Some(conditions.clone()),
         grow: args["cfg_grow_conditioning"].as_bool().unwrap_or(false),
         ..DecodingSettings::default()
     };
@@ -228,7 +228,7 @@ fn filters(mut file: Vectors, report: &mut Report) -> Outcome {
             top_k: top_k(&case["top_k"], case["top_k_is_int"] == Value::Bool(true)),
             top_p: case["top_p"].as_f64().unwrap_or(0.0),
             temperature: 1.0,
-            draw: Sampling::Random,
+            sampling: Sampling::Random,
         };
         let mut kept = vec![false; values.len()];
         for (row, logits) in values.chunks(shape[1]).enumerate() {
@@ -319,7 +319,7 @@ fn generation(folder: &Path, stem: &str, report: &mut Report) -> Outcome {
     let number = |key: &str| settings[key].as_f64().unwrap_or(0.0);
     let mut decoding = DecodingSettings {
         order: Order::Chained,
-        hide: Some(names(&settings["cfg_hidden_at_start"])),
+        uncond_drop: Some(names(&settings["cfg_hidden_at_start"])),
         grow: settings["cfg_grow_conditioning"].as_bool().unwrap_or(false),
         ..DecodingSettings::default()
     };
@@ -330,7 +330,7 @@ fn generation(folder: &Path, stem: &str, report: &mut Report) -> Outcome {
     decoding.all.guidance = number("cfg_scale");
     decoding.all.top_p = number("top_p");
     decoding.all.top_k = top_k(&settings["top_k"], settings["top_k"].is_u64());
-    decoding.all.draw = Sampling::MostLikely;
+    decoding.all.sampling = Sampling::MostLikely;
 
     // Random positions are inputs: (modality, step within its target) -> what the reference drew.
     let mut positions = BTreeMap::new();

@@ -12,7 +12,7 @@ pub struct Filter {
     /// Tokens after the one that crosses this mass are dropped; 0 (or 1) is off.
     pub top_p: f64,
     pub temperature: f64,
-    pub draw: Sampling,
+    pub sampling: Sampling,
 }
 
 /// How many of the largest logits stay.
@@ -93,7 +93,7 @@ pub fn pick(logits: &[f32], filter: &Filter, uniform: f64) -> Pick {
                 .map(|&l| weight(l))
                 .filter(|w| w.is_finite())
                 .sum();
-            let token = match filter.draw {
+            let token = match filter.sampling {
                 Sampling::MostLikely => best,
                 Sampling::Random => {
                     drawn(logits.iter().map(|&l| weight(l)), uniform * total).unwrap_or(best)
@@ -103,7 +103,7 @@ pub fn pick(logits: &[f32], filter: &Filter, uniform: f64) -> Pick {
         }
         Some(kept) => {
             let total: f64 = kept.iter().map(|&i| weight(logits[i as usize])).sum();
-            let token = match filter.draw {
+            let token = match filter.sampling {
                 Sampling::MostLikely => best,
                 Sampling::Random => drawn(
                     kept.iter().map(|&i| weight(logits[i as usize])),
@@ -242,7 +242,7 @@ mod tests {
         top_k: TopK::Off,
         top_p: 0.0,
         temperature: 1.0,
-        draw: Sampling::Random,
+        sampling: Sampling::Random,
     };
 
     #[test]

@@ -17,9 +17,9 @@ pub struct Generated {
 /// Tokens of one target.
 #[derive(Debug, Clone, PartialEq)]
 pub struct GeneratedTokens {
-    /// One per position; tokens that were given stand unchanged.
+    /// One per position; tokens of inputs stand unchanged.
     pub ids: Vec<u32>,
-    /// 0 (the model knew nothing) to 1 (it was certain), from the entropy when the token was decided; 1 for given tokens.
+    /// 0 (the model knew nothing) to 1 (it was certain), from the entropy when the token was decided; 1 for inputs.
     pub confidence: Vec<f32>,
 }
 
@@ -28,7 +28,7 @@ pub struct GeneratedTokens {
 pub struct StepTrace {
     pub modality: usize,
     pub step: usize,
-    /// The target_positions positions of each sample.
+    /// The target positions of each sample.
     pub positions: Vec<Vec<u32>>,
     /// `[rows, vocabulary]`.
     pub conditional: Vec<f32>,
@@ -68,7 +68,7 @@ pub fn generate<M: TokenModel>(
     generate_checked(model, settings, samples, targets, seed, &mut checks)
 }
 
-/// [`generate`] once per seed. What the encoder makes of the given tokens, and answers that are target_positions for again, are shared.
+/// [`generate`] once per seed. The encoder output for the inputs, and the decoder output for target positions that come again, are shared.
 ///
 /// # Errors
 /// As [`generate`].
@@ -177,7 +177,7 @@ mod tests {
     use std::cell::Cell;
     use std::ops::Range;
 
-    /// DecoderOutput depend on which tokens are visible and on nothing else; counts its encoder passes.
+    /// Its output depends on which tokens are visible and on nothing else; counts its encoder passes.
     struct Toy {
         modalities: Vec<TokenModality>,
         encoded: Cell<usize>,
@@ -296,7 +296,12 @@ mod tests {
 
     #[test]
     fn neither_the_batch_nor_the_threads_change_a_token() {
-        for order in [Order::Independent, Order::Chained, Order::Joint] {
+        for order in [
+            Order::Independent,
+            Order::Chained,
+            Order::Joint,
+            Order::Pooled,
+        ] {
             for scheme in [Scheme::Roar, Scheme::Maskgit] {
                 let settings = settings(order, scheme);
                 let run = |samples: &[Sample<'_>]| {
@@ -315,6 +320,39 @@ mod tests {
                     ids(&both, "camera")[0],
                     "another seed"
                 );
+            }
+        }
+    }
+
+    #[test]
+    fn a_pool_decides_an_equal_share_of_all_targets_together_in_every_step() {
+        let mut settings = settings(Order::Pooled, Scheme::Roar);
+        settings.all.steps = 3;
+        let mut trace = Vec::new();
+        let mut checks = Checks {
+            positions: BTreeMap::new(),
+            trace: Some(&mut trace),
+        };
+        let names = ["camera", "body"];
+        let samples = [sample(1), sample(2)];
+        generate_checked(&toy(), &settings, &samples, &names, 5, &mut checks).unwrap();
+        let masked: usize = names
+            .iter()
+            .map(|name| {
+                toy()
+                    .modalities()
+                    .iter()
+                    .find(|m| m.name == *name)
+                    .unwrap()
+                    .tokens
+            })
+            .sum();
+        let counts = super::super::schedule::linear(3, masked);
+        for sample in 0..samples.len() {
+            for (step, count) in counts.iter().enumerate() {
+                let of_step = trace.iter().filter(|t| t.step == step);
+                let decided: usize = of_step.map(|t| t.selected[sample].len()).sum();
+                assert_eq!(decided, *count);
             }
         }
     }
@@ -354,7 +392,7 @@ mod tests {
         model.encoded.set(0);
         let guided = settings(Order::Independent, Scheme::Roar);
         generate(&model, &guided, &[sample(1)], &["camera", "body"], 0).unwrap();
-        // Two targets of three steps, with and without conditions; what was given is shared.
+        // Two targets of three steps, with and without conditions; what the inputs give is shared.
         assert_eq!(model.encoded.get(), 11);
     }
 

@@ -33,7 +33,7 @@ impl<'m> MgetTokens<'m> {
 /// The decoder's output and which rows are whose.
 #[derive(Debug, Clone)]
 pub struct MgetOutput {
-    /// `None` when nothing was target_positions.
+    /// `None` when there was no target.
     y_MD: Option<Tensor<2>>,
     target_positions: Sequence,
 }

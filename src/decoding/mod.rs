@@ -1,7 +1,7 @@
-//! Iterative parallel decoding (Supp. C): given any tokens, generate any others.
+//! Iterative parallel decoding (Supp. C): any tokens as inputs, any others as targets.
 //!
 //! Read in this order: [`settings`] (a registry entry), [`schedule`] (tokens and temperature per step), [`plan`] (which target
-//! when, from what), [`model`] (what a model must answer), [`filter`] (logits to a token), [`mod@generate`] (the
+//! when, from what), [`model`] (what it needs of a model), [`filter`] (logits to a token), [`mod@generate`] (the
 //! entry), `round` (**the loop**), [`mget`] (the model), [`reconstructor`] (a model folder with its tokenizers as one function
 //! from clips to clips).
 

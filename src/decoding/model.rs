@@ -1,4 +1,4 @@
-//! What decoding asks of a model: read the known tokens, answer for unknown ones. MGET is one; tests bring their own.
+//! What decoding needs of a model: encode the known tokens, decode masked ones. MGET is one; tests bring their own.
 
 use crate::mget::Content;
 use std::ops::Range;
@@ -71,14 +71,14 @@ impl Slot<'_> {
     }
 }
 
-/// Positions target_positions of every sample: `[samples][modalities][positions]`.
+/// Target positions of every sample: `[samples][modalities][positions]`.
 pub type TargetPositions = Vec<Vec<Vec<u32>>>;
 
 /// A masked model of tokens.
 pub trait TokenModel {
     /// What the encoder made of the known tokens.
     type Context;
-    /// What the decoder made of the target_positions positions, before the output matrices.
+    /// What the decoder made of the target positions, before the output matrices.
     type DecoderOutput;
 
     /// Its modalities, in the order of every `slots` and `target_positions`.
@@ -94,7 +94,7 @@ pub trait TokenModel {
         hidden: &[bool],
     ) -> Result<Self::Context, DecodingError>;
 
-    /// DecoderOutput for the target_positions positions. Positions of different modalities do not see each other.
+    /// Decodes the target positions. Positions of different modalities do not see each other.
     ///
     /// # Errors
     /// When a position does not exist.
@@ -104,10 +104,10 @@ pub trait TokenModel {
         target_positions: &TargetPositions,
     ) -> Result<Self::DecoderOutput, DecodingError>;
 
-    /// Logits `[rows, vocabulary]` of a range of the rows of one modality, samples in order, positions as target_positions.
+    /// Logits `[rows, vocabulary]` of a range of the rows of one modality, samples in order, positions as in the targets.
     ///
     /// # Errors
-    /// When the rows were not target_positions.
+    /// When the rows were not among the targets.
     fn logits(
         &self,
         decoder_output: &Self::DecoderOutput,
@@ -121,7 +121,7 @@ pub trait TokenModel {
 pub enum DecodingError {
     #[error("the model has no modality `{name}`; it has {known:?}")]
     UnknownModality { name: String, known: Vec<String> },
-    #[error("`{name}` can only be given, never generated")]
+    #[error("`{name}` can only be an input, never generated")]
     NotPredicted { name: String },
     #[error("sample {sample}: {found} slots for {expected} modalities")]
     Slots {

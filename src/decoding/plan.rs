@@ -1,9 +1,9 @@
 //! From settings to steps: what is decided when, from which inputs, and what the pass without conditions does not see.
 
 use super::model::{DecodingError, TokenModality};
-use super::settings::{DecodingSettings, Order, TargetSettings};
+use super::settings::{DecodingSettings, Order, Scheme, TargetSettings};
 
-/// Chains are independent of each other: each starts from what was given.
+/// Chains are independent of each other: each starts from the inputs.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Chain {
     /// One after the other; what a group decides is input to the next.
@@ -16,6 +16,8 @@ pub struct Group {
     pub targets: Vec<Target>,
     /// By modality: not seen by the pass without conditions.
     pub hidden: Vec<bool>,
+    /// Tokens decided by each step from the pool of all targets; `None`: every target has its own counts.
+    pub pooled: Option<Vec<usize>>,
 }
 
 /// One target and its steps.
@@ -34,6 +36,9 @@ impl Group {
     /// Steps of the longest target.
     #[must_use]
     pub fn steps(&self) -> usize {
+        if let Some(pooled) = &self.pooled {
+            return pooled.len();
+        }
         self.targets
             .iter()
             .map(|t| t.counts.len())
@@ -42,7 +47,7 @@ impl Group {
     }
 }
 
-/// The plan for `targets`; `given[m]` says which modalities have known tokens, `open[m]` how many are still open.
+/// The plan for the targets `names`; `given[m]` says which modalities have input tokens, `open[m]` how many are still open.
 ///
 /// # Errors
 /// When a name is unknown or a target is raw video.
@@ -51,7 +56,7 @@ pub fn plan(
     modalities: &[TokenModality],
     given: &[bool],
     open: &[usize],
-    targets: &[&str],
+    names: &[&str],
 ) -> Result<Vec<Chain>, DecodingError> {
     let index = |name: &str| {
         modalities
@@ -62,21 +67,21 @@ pub fn plan(
                 known: modalities.iter().map(|m| m.name.clone()).collect(),
             })
     };
-    let mut wanted = Vec::new();
-    for name in targets {
+    let mut targets = Vec::new();
+    for name in names {
         let modality = index(name)?;
         if modalities[modality].vocabulary.is_none() {
             return Err(DecodingError::NotPredicted {
                 name: (*name).to_owned(),
             });
         }
-        if !wanted.contains(&modality) {
-            wanted.push(modality);
+        if !targets.contains(&modality) {
+            targets.push(modality);
         }
     }
-    let hidden: Vec<bool> = match &settings.hide {
+    let hidden: Vec<bool> = match &settings.uncond_drop {
         None => (0..modalities.len())
-            .map(|m| given[m] && !wanted.contains(&m))
+            .map(|m| given[m] && !targets.contains(&m))
             .collect(),
         // A name the model does not have hides nothing: presets name the inputs of every model.
         Some(names) => modalities.iter().map(|m| names.contains(&m.name)).collect(),
@@ -101,6 +106,7 @@ pub fn plan(
                 let group = Group {
                     targets: vec![target(modality)],
                     hidden: hidden.clone(),
+                    pooled: None,
                 };
                 hidden[modality] |= settings.grow;
                 group
@@ -109,17 +115,38 @@ pub fn plan(
         Chain { groups }
     };
     Ok(match settings.order {
-        Order::Chained => vec![chain(&wanted)],
+        Order::Chained => vec![chain(&targets)],
         Order::Joint => vec![Chain {
             groups: vec![Group {
-                targets: wanted.iter().map(|&m| target(m)).collect(),
+                targets: targets.iter().map(|&m| target(m)).collect(),
                 hidden,
+                pooled: None,
             }],
         }],
+        Order::Pooled => {
+            let masked = targets.iter().map(|&m| open[m]).sum();
+            let counts = super::schedule::linear(settings.all.steps, masked);
+            let in_pool = |&m: &usize| {
+                let mut target = target(m);
+                // The steps are the pool's; a target may have no token in one of them.
+                target.settings.scheme = Scheme::Roar;
+                let own = &target.settings;
+                target.temperatures = own.temperature_schedule.values(own.temperature, &counts);
+                target.counts = vec![0; counts.len()];
+                target
+            };
+            vec![Chain {
+                groups: vec![Group {
+                    targets: targets.iter().map(in_pool).collect(),
+                    hidden,
+                    pooled: Some(counts.clone()),
+                }],
+            }]
+        }
         Order::Independent => {
             let mut chains: Vec<Chain> = Vec::new();
             let mut done = vec![false; modalities.len()];
-            for &modality in &wanted {
+            for &modality in &targets {
                 if done[modality] {
                     continue;
                 }
@@ -130,7 +157,7 @@ pub fn plan(
                         Some(list) => list
                             .iter()
                             .filter_map(|name| {
-                                wanted
+                                targets
                                     .iter()
                                     .copied()
                                     .find(|&m| &modalities[m].name == name)
@@ -152,8 +179,8 @@ impl TargetSettings {
     fn schedule_counts(&self, tokens: usize) -> Vec<usize> {
         // Random positions are spread evenly: there is nothing to be careful about first.
         match self.scheme {
-            super::settings::Scheme::Roar => super::schedule::linear(self.steps, tokens),
-            super::settings::Scheme::Maskgit => self.schedule.counts(self.steps, tokens),
+            Scheme::Roar => super::schedule::linear(self.steps, tokens),
+            Scheme::Maskgit => self.schedule.counts(self.steps, tokens),
         }
     }
 }

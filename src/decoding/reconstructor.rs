@@ -210,7 +210,7 @@ impl Reconstructor {
         self.decode(clips, &generated, request)
     }
 
-    /// Generates the tokens of what is targets, once per sample that is averaged; the middle of [`Reconstructor::reconstruct`].
+    /// Generates the tokens of the targets, once per sample that is averaged; the middle of [`Reconstructor::reconstruct`].
     ///
     /// # Errors
     /// When a modality is unknown.

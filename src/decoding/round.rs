@@ -16,18 +16,18 @@ struct State<'a> {
     samples: Vec<Sample<'a>>,
     /// By (sample, modality).
     confidence: BTreeMap<(usize, usize), Vec<f32>>,
-    /// Nothing was decided yet: the encoder sees exactly what was given.
+    /// Nothing was decided yet: the encoder reads the inputs alone.
     untouched: bool,
 }
 
-/// Samples of the same questions with different seeds.
+/// Generations of the same targets with different seeds.
 pub(super) struct Samples<'m, M: TokenModel> {
     model: &'m M,
     seed: u64,
-    /// The encoder's view of what was given: the first step of every chain starts from it.
+    /// The encoder's output for the inputs: the first step of every chain starts from it.
     given: Option<M::Context>,
-    /// DecoderOutput of the first round to questions about what was given: where all tokens are decided at once, every round has the
-    /// same questions.
+    /// Decoder output of the first sample for the inputs alone: where all tokens are decided at once, every sample has the same
+    /// target positions.
     answered: Vec<(TargetPositions, Rc<M::DecoderOutput>)>,
     keep: bool,
 }
@@ -57,7 +57,7 @@ impl<'m, M: TokenModel> Samples<'m, M> {
         self.seed = seed;
         let mut generated = vec![Generated::default(); samples.len()];
         for chain in chains {
-            // Every chain starts from what was given; what it decides is known to the rest of the chain only.
+            // Every chain starts from the inputs; what it decides is known to the rest of the chain only.
             let mut state = State {
                 samples: samples.to_vec(),
                 confidence: BTreeMap::new(),
@@ -92,8 +92,8 @@ impl<'m, M: TokenModel> Samples<'m, M> {
         Ok(generated)
     }
 
-    /// DecoderOutput from what was given alone.
-    fn answers_to_given(
+    /// Decoder output for the inputs alone.
+    fn output_for_inputs(
         &mut self,
         samples: &[Sample<'_>],
         target_positions: &TargetPositions,
@@ -131,13 +131,16 @@ impl<'m, M: TokenModel> Samples<'m, M> {
             .iter()
             .filter(|t| step < t.counts.len())
             .collect();
-        let target_positions = self.target_positions(&active, step, state, checks);
+        let target_positions = match &group.pooled {
+            Some(counts) => self.pooled_positions(&active, step, counts[step], state),
+            None => self.target_positions(&active, step, state, checks),
+        };
         let guided =
             active.iter().any(|t| t.settings.guidance != 1.0) && group.hidden.iter().any(|h| *h);
 
         let nothing_hidden = vec![false; group.hidden.len()];
         let conditional = if state.untouched {
-            self.answers_to_given(&state.samples, &target_positions, &nothing_hidden)?
+            self.output_for_inputs(&state.samples, &target_positions, &nothing_hidden)?
         } else {
             let context = self.model.encode(&state.samples, &nothing_hidden)?;
             Rc::new(self.model.decode(&context, &target_positions)?)
@@ -164,6 +167,41 @@ impl<'m, M: TokenModel> Samples<'m, M> {
         }
         state.untouched = false;
         Ok(())
+    }
+
+    /// `count` random positions of each sample, of all masked ones of the targets together.
+    fn pooled_positions(
+        &self,
+        active: &[&Target],
+        step: usize,
+        count: usize,
+        state: &State<'_>,
+    ) -> TargetPositions {
+        let choose = |sample: &Sample<'_>| {
+            let pool: Vec<(usize, u32)> = active
+                .iter()
+                .flat_map(|target| {
+                    let masked = sample.slots[target.modality].masked_positions();
+                    masked.into_iter().map(|p| (target.modality, p))
+                })
+                .collect();
+            let mut rng = crate::random::stream(
+                self.seed,
+                "decoding.positions.pooled",
+                step as u64,
+                sample.id,
+            );
+            let mut positions = vec![Vec::new(); self.model.modalities().len()];
+            for i in index::sample(&mut rng, pool.len(), count.min(pool.len())) {
+                let (modality, position) = pool[i];
+                positions[modality].push(position);
+            }
+            for own in &mut positions {
+                own.sort_unstable();
+            }
+            positions
+        };
+        state.samples.iter().map(choose).collect()
     }
 
     fn target_positions(

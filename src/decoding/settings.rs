@@ -20,12 +20,15 @@ pub enum Scheme {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Order {
-    /// Every target sees only what was given (and, within a chain of `chains`, the targets before it).
+    /// Every target sees only the inputs (and, within a chain of `chains`, the targets before it).
     Independent,
     /// One after the other; finished targets are inputs of the next.
     Chained,
-    /// All targets in every step.
+    /// All targets in every step, each by its own schedule.
     Joint,
+    /// All targets in every step, from one pool: of the n masked tokens of all targets, every step decides n / `steps` random
+    /// ones, whichever modality they are of (Supp. C). `steps` is that of `all`; the scheme is `roar`.
+    Pooled,
 }
 
 /// How tokens of one target are decided.
@@ -47,7 +50,7 @@ pub struct TargetSettings {
     #[schemars(range(min = 0.0, max = 1.0))]
     pub top_p: f64,
     pub top_k: TopK,
-    pub draw: Sampling,
+    pub sampling: Sampling,
 }
 
 impl Default for TargetSettings {
@@ -61,7 +64,7 @@ impl Default for TargetSettings {
             guidance: 2.0,
             top_p: 0.8,
             top_k: TopK::Off,
-            draw: Sampling::Random,
+            sampling: Sampling::Random,
         }
     }
 }
@@ -72,7 +75,7 @@ impl TargetSettings {
             top_k: self.top_k,
             top_p: self.top_p,
             temperature,
-            draw: self.draw,
+            sampling: self.sampling,
         }
     }
 }
@@ -105,23 +108,23 @@ pub struct TargetChanges {
     #[serde(skip_serializing_if = "Option::is_none")]
     pub top_k: Option<TopK>,
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub draw: Option<Sampling>,
+    pub sampling: Option<Sampling>,
     /// How many of the samples are decoded for the mean; fewer for video, whose decoding takes longest.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schemars(range(min = 1))]
     pub samples: Option<usize>,
 }
 
-/// How targets are generated from whatever is given.
+/// How targets are generated from the inputs.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct DecodingSettings {
     pub order: Order,
     /// With `order: independent`: targets that are chained nevertheless, each list in its order.
     pub chains: Vec<Vec<String>>,
-    /// Modalities that the pass without conditions does not see; absent: everything that was given.
+    /// Modalities that the pass without conditions does not see; absent: all inputs.
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub hide: Option<Vec<String>>,
+    pub uncond_drop: Option<Vec<String>>,
     /// The pass without conditions does not see finished targets of its chain either.
     pub grow: bool,
     /// How often every clip is generated; the answer is the mean of the decoded signals. One sample looks like a motion that
@@ -139,7 +142,7 @@ impl Default for DecodingSettings {
         Self {
             order: Order::Independent,
             chains: Vec::new(),
-            hide: None,
+            uncond_drop: None,
             grow: true,
             samples: 1,
             all: TargetSettings::default(),
@@ -174,7 +177,7 @@ impl DecodingSettings {
             guidance: changes.guidance.unwrap_or(all.guidance),
             top_p: changes.top_p.unwrap_or(all.top_p),
             top_k: changes.top_k.unwrap_or(all.top_k),
-            draw: changes.draw.unwrap_or(all.draw),
+            sampling: changes.sampling.unwrap_or(all.sampling),
         }
     }
 }

@@ -24,6 +24,8 @@ const RENAMED: &[(&str, &str)] = &[
     ("velocity", "velocity_weight"),
     ("commitment", "commitment_weight"),
     ("floor", "reconstruction_bound"),
+    ("hide", "uncond_drop"),
+    ("draw", "sampling"),
 ];
 
 /// What `old` is called since it was renamed, where that is one of the `known` keys.

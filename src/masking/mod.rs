@@ -1,4 +1,4 @@
-//! Masking: which tokens of a sample are given, and which are asked for (Sec. 4.3, Supp. B, Alg. 1).
+//! Masking: which tokens of a sample are inputs, and which are targets (Sec. 4.3, Supp. B, Alg. 1).
 //!
 //! Read in this order: [`settings`] (a registry entry), [`dirichlet`] (proportions in log space), [`budget`] (proportions to
 //! token counts), [`policy`] (the draw for one sample), [`statistics`] (what a policy does on average, for `reviv plan`).
@@ -23,14 +23,14 @@ pub struct Slot {
     pub name: String,
     /// How many tokens a sample has of it.
     pub tokens: usize,
-    /// Whether it may be given.
+    /// Whether it may be an input.
     pub input: bool,
-    /// Whether it may be asked for.
+    /// Whether it may be a target.
     pub target: bool,
 }
 
 impl Slot {
-    /// A modality that may be given and asked for.
+    /// A modality that may be input and target.
     #[must_use]
     pub fn both(name: &str, tokens: usize) -> Self {
         Self {
@@ -41,7 +41,7 @@ impl Slot {
         }
     }
 
-    /// A modality that is only ever given, such as raw video.
+    /// A modality that is only ever an input, such as raw video.
     #[must_use]
     pub fn input_only(name: &str, tokens: usize) -> Self {
         Self {
@@ -51,23 +51,23 @@ impl Slot {
     }
 }
 
-/// The masks of one sample: per slot the positions that are given and those that are asked for, each ascending, disjoint.
+/// The masks of one sample: per slot the input positions and the target positions, each ascending, disjoint.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Mask {
-    /// `[slots][given positions]`.
+    /// `[slots][input positions]`.
     pub input: Vec<Vec<u32>>,
-    /// `[slots][asked positions]`.
+    /// `[slots][target positions]`.
     pub target: Vec<Vec<u32>>,
 }
 
 impl Mask {
-    /// How many positions are given.
+    /// How many positions are inputs.
     #[must_use]
     pub fn input_tokens(&self) -> usize {
         self.input.iter().map(Vec::len).sum()
     }
 
-    /// How many positions are asked for.
+    /// How many positions are targets.
     #[must_use]
     pub fn target_tokens(&self) -> usize {
         self.target.iter().map(Vec::len).sum()

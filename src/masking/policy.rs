@@ -119,7 +119,7 @@ impl Masking {
         let input = side(&input_alphas, inputs, &tokens).draw(shared.as_deref(), rng);
         let room: Vec<usize> = tokens.iter().zip(&input).map(|(n, b)| n - b).collect();
         let target = if let Some(mut shares) = shared {
-            // What the input gave to a modality that is never asked for is not passed on (Alg. 1 to the letter).
+            // What the input gave to a modality that is never a target is not passed on (Alg. 1 to the letter).
             for (share, alpha) in shares.iter_mut().zip(&target_alphas) {
                 *share = if *alpha > 0.0 { *share } else { 0.0 };
             }
@@ -315,7 +315,7 @@ mod tests {
     }
 
     #[test]
-    fn given_and_asked_are_disjoint_in_range_and_within_budget() {
+    fn inputs_and_targets_are_disjoint_in_range_and_within_budget() {
         for settings in policies() {
             for mask in masks(&settings, &[true; 5], 60) {
                 assert!(mask.input_tokens() <= 2048 && mask.target_tokens() <= 2048);

@@ -19,9 +19,9 @@ pub struct MaskingSettings {
     pub input_alpha: BTreeMap<String, Alphas>,
     /// Concentrations of single modalities on the target side; 0 means never.
     pub target_alpha: BTreeMap<String, Alphas>,
-    /// The only modalities that are given; empty means all. `pixels` is raw video.
+    /// The only modalities that are inputs; empty means all. `pixels` is raw video.
     pub inputs: Vec<String>,
-    /// The only modalities that are asked for; empty means all. Raw video is never asked for.
+    /// The only modalities that are targets; empty means all. Raw video is never a target.
     pub targets: Vec<String>,
     /// Visible tokens of a sample: a number, or `{min, max}`.
     pub input_tokens: TokenBudget,
@@ -245,7 +245,7 @@ impl MaskingSettings {
         let target = side("target_alpha", &self.target_alpha, &self.targets, |slot| {
             slot.target
         })?;
-        for (table, side) in [(&input, "inputs"), (&target, "asked for")] {
+        for (table, side) in [(&input, "an input"), (&target, "a target")] {
             if table.iter().flatten().all(|alpha| *alpha == 0.0) {
                 return Err(MaskingError::NothingLeft { side });
             }
@@ -369,9 +369,9 @@ mod tests {
         assert!(refused(|s| s.alpha = Alphas::Mixture(vec![])).contains("no component"));
         assert!(refused(|s| s.targets = vec!["bodi".into()]).contains("body, camera"));
         assert!(
-            refused(|s| s.targets = vec![PIXELS.into()]).contains("no modality can be asked for")
+            refused(|s| s.targets = vec![PIXELS.into()]).contains("no modality can be a target")
         );
-        assert!(refused(|s| s.alpha = Alphas::One(0.0)).contains("no modality can be given"));
+        assert!(refused(|s| s.alpha = Alphas::One(0.0)).contains("no modality can be an input"));
     }
 
     #[test]

@@ -7,7 +7,7 @@ use super::model::{Mget, decoder_segments};
 use crate::engine::{Gradients, Parameters, Segments, Tensor};
 
 impl Mget {
-    /// The losses of a batch, and the gradients of `share` times their total; `None` when nothing is targets or the total is not
+    /// The losses of a batch, and the gradients of `share` times their total; `None` when there is no target or the total is not
     /// finite. Equal to [`Mget::losses`] and [`Gradients::of`] up to rounding.
     #[must_use]
     pub fn recomputed(
@@ -106,7 +106,7 @@ impl Mget {
         inputs
     }
 
-    /// The input of every block of the decoder, and the output of the last; nothing when nothing is targets.
+    /// The input of every block of the decoder, and the output of the last; empty when there are no targets.
     fn decoder_inputs(&self, context_ND: Option<&Tensor<2>>, batch: &Batch) -> Vec<Tensor<2>> {
         let targets = &batch.targets.sequence;
         if targets.is_empty() {
@@ -122,7 +122,7 @@ impl Mget {
     }
 }
 
-/// A value whose gradient is targets for.
+/// A value whose gradient is needed.
 fn leaf(value: &Tensor<2>) -> Tensor<2> {
     value.clone().autodiff().require_grad()
 }

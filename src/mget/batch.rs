@@ -1,4 +1,4 @@
-//! Packed batches: the given and asked tokens of several samples, one after the other, without padding.
+//! Packed batches: the input and target tokens of several samples, one after the other, without padding.
 //!
 //! Within a sample, tokens stand by modality in the order of the spec and by position within a modality. Attention runs over
 //! whole samples in the encoder and over single runs (one modality of one sample) in the decoder.
@@ -89,7 +89,7 @@ pub struct EncoderInput {
     pub values: Vec<Values>,
 }
 
-/// What the decoder is asked for.
+/// What the decoder predicts.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Targets {
     /// Where the queries stand.
@@ -163,7 +163,7 @@ impl Batch {
 }
 
 impl EncoderInput {
-    /// Packs what is given of each sample.
+    /// Packs the inputs of each sample.
     ///
     /// # Errors
     /// As [`Batch::new`].
@@ -202,7 +202,7 @@ impl EncoderInput {
 }
 
 impl Targets {
-    /// Packs what is asked of each sample.
+    /// Packs the targets of each sample.
     ///
     /// # Errors
     /// As [`Batch::new`].

@@ -1,7 +1,7 @@
 //! How modalities enter and leave the model.
 //!
 //! A visible token is its row of the modality's table (or its tubelet through one linear map) plus its place: a fixed position
-//! code and the modality's learned vector. An asked token is the mask token plus its place. The output matrix of a modality is
+//! code and the modality's learned vector. A decoder query is the mask token plus its positional embedding. The output matrix of a modality is
 //! the decoder's own token table; the place is shared by encoder and decoder.
 
 use super::batch::{EncoderInput, Sequence, Values};

@@ -1,4 +1,4 @@
-//! Cross-entropy over asked tokens (Eq. 3).
+//! Cross-entropy over target tokens (Eq. 3).
 
 use super::batch::Targets;
 use super::embedding::Heads;
@@ -27,7 +27,7 @@ pub enum Loss {
 /// The losses of one batch.
 #[derive(Debug, Clone)]
 pub struct Losses {
-    /// What training minimises, `[1]`; `None` when nothing was asked.
+    /// What training minimises, `[1]`; `None` when there is no target.
     pub total: Option<Tensor<1>>,
     /// Per modality of the spec.
     pub modalities: Vec<Option<ModalityLoss>>,
@@ -45,7 +45,7 @@ pub struct ModalityLoss {
 /// Numbers read back from [`Losses`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct LossValues {
-    /// What training minimises; 0 when nothing was asked.
+    /// What training minimises; 0 when there is no target.
     pub total: f64,
     /// Per modality of the spec: mean cross-entropy in nats and its number of tokens.
     pub modalities: Vec<Option<(f64, usize)>>,

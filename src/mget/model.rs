@@ -1,9 +1,9 @@
 //! The Masked Generative Egocentric Transformer (Sec. 4.3, Supp. B).
 //!
-//! An encoder reads the visible tokens of all modalities; a decoder answers for targets positions, knowing only where they are
-//! and what the encoder saw. Samples are packed without padding.
+//! An encoder reads the visible tokens of all modalities; a decoder predicts the target positions, knowing only where they are
+//! and what the encoder read. Samples are packed without padding.
 //!
-//! Shape suffixes: `N` visible tokens of the batch, `M` targets tokens of the batch, `D` width, `V` vocabulary.
+//! Shape suffixes: `N` visible tokens of the batch, `M` target tokens of the batch, `D` width, `V` vocabulary.
 
 use super::batch::{Batch, EncoderInput, Sequence};
 use super::embedding::{Embeddings, Heads};
@@ -111,7 +111,7 @@ impl Mget {
         self.losses_of(y_MD, batch, kind)
     }
 
-    /// The losses of the decoder's answers.
+    /// The losses of the decoder's output.
     pub(super) fn losses_of(&self, y_MD: Option<Tensor<2>>, batch: &Batch, kind: Loss) -> Losses {
         loss::losses(
             &self.spec,
@@ -150,7 +150,7 @@ impl Mget {
         }
     }
 
-    /// What the encoder starts from, `[N, D]`: what a token says and where it stands. The init is used again in the context.
+    /// What the encoder starts from, `[N, D]`: token plus positional embedding. The latter is used again in the context.
     pub(super) fn input_embedding(
         &self,
         visible: &EncoderInput,
@@ -164,7 +164,7 @@ impl Mget {
         self.decoder_proj_context.forward(h_ND) + positional_ND
     }
 
-    /// Answers for the targets positions: `[M, D]`; `None` when nothing is targets.
+    /// Decodes the target positions: `[M, D]`; `None` when there are none.
     #[must_use]
     pub fn decode(&self, context: &Context, targets: &Sequence) -> Option<Tensor<2>> {
         if targets.is_empty() {
@@ -178,13 +178,13 @@ impl Mget {
         Some(self.decoder_norm.forward(y_MD))
     }
 
-    /// What the decoder starts from, `[M, D]`: where it is targets, and nothing else.
+    /// What the decoder starts from, `[M, D]`: the positions of the targets, and nothing else.
     pub(super) fn decoder_queries(&self, targets: &Sequence) -> Tensor<2> {
         let mask_token_1D: Tensor<2> = self.mask_token.reshaped([1, self.spec.size.width]);
         self.encoder_embeddings.positional_embedding(targets) + mask_token_1D
     }
 
-    /// The logits of the targets tokens of `modality`, in order: `[its rows, V]`; `None` when it has none.
+    /// The logits of the target tokens of `modality`, in order: `[its rows, V]`; `None` when it has none.
     #[must_use]
     pub fn logits(
         &self,
@@ -283,7 +283,7 @@ impl DecoderBlock {
     }
 }
 
-/// Who attends to whom: an targets token to those of its own modality in its own sample, and to all `visible` (rows per sample) of
+/// Who attends to whom: a target token to those of its own modality in its own sample, and to all `visible` (rows per sample) of
 /// the sample.
 pub(super) fn decoder_segments(visible: &[usize], targets: &Sequence) -> (Segments, Segments) {
     (

@@ -372,7 +372,7 @@ impl MgetSpec {
         self.size.trunk_parameters() + modalities
     }
 
-    /// Multiply-accumulates of one forward pass over a sample with `inputs` visible and `targets` asked tokens, the targets
+    /// Multiply-accumulates of one forward pass over a sample with `inputs` visible and `targets` target tokens, the targets
     /// spread over modalities as `targets_of` says.
     #[must_use]
     pub fn multiply_accumulates(&self, inputs: usize, targets_of: &[usize]) -> f64 {

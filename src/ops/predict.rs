@@ -30,7 +30,7 @@ const BATCH: usize = 8;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct PredictSettings {
-    /// Modalities the model is inputs: `rgb` is the video's tokens, and raw video where the model takes it; `pixels` is raw video
+    /// Modalities the model is conditioned on: `rgb` is the video's tokens, and raw video where the model takes it; `pixels` is raw video
     /// alone.
     pub inputs: Vec<String>,
     /// Modalities it generates; empty means all others.

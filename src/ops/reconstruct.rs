@@ -42,7 +42,7 @@ pub struct ReconstructSettings {
     pub clip: usize,
     /// A model folder that no stage makes.
     pub model_folder: Option<FilePath>,
-    /// What of the video the model is inputs: `rgb` is its tokens, and raw video where the model takes it; `pixels` is raw video
+    /// What of the video the model is conditioned on: `rgb` is its tokens, and raw video where the model takes it; `pixels` is raw video
     /// alone. Empty means `rgb`, or `pixels` for a model without tokens of video.
     pub inputs: Vec<String>,
     /// What is generated; empty means everything but `rgb`.

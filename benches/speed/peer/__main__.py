@@ -22,7 +22,7 @@ CASES = {
     "mget-tiny": lambda repeats: mget.run("tiny", repeats),
     "mget-base": lambda repeats: mget.run("base", repeats),
     "decoding-fast": lambda repeats: decoding.run("fast", repeats),
-    "decoding-paper": lambda repeats: decoding.run("paper", repeats),
+    "decoding-release": lambda repeats: decoding.run("release", repeats),
 }
 
 case, repeats, threads = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])

@@ -1,6 +1,6 @@
 """Decoding with the tiny MGET: camera, gaze and body of one clip from its video tokens.
 
-The presets are `registry/decoding/fast.yaml` and `registry/decoding/paper.yaml`. Passes are shared as on our side: what the
+The presets are `registry/decoding/fast.yaml` and `registry/decoding/release.yaml`. Passes are shared as on our side: what the
 encoder makes of the given tokens alone is kept, and a pass without conditions that sees nothing skips encoder and
 cross-attention.
 """
@@ -17,7 +17,7 @@ TEMPERATURE, TOP_P = 0.01, 0.8
 # Targets that are decided together, steps, scale of the guidance (1: none).
 PRESETS = {
     "fast": ([["camera", "gaze", "body"]], 1, 1.0),
-    "paper": ([["camera"], ["gaze"], ["body"]], 3, 2.0),
+    "release": ([["camera"], ["gaze"], ["body"]], 3, 2.0),
 }
 
 
