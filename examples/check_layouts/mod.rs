@@ -4,8 +4,10 @@ pub mod compare;
 pub mod golden;
 pub mod report;
 
+mod ego_exo4d;
 mod egogen;
 mod holoassist;
+mod nymeria;
 
 use std::path::Path;
 
@@ -18,7 +20,12 @@ pub type Outcome<T = ()> = Result<T, Box<dyn std::error::Error>>;
 type Check = fn(&Path, &mut Report) -> Outcome;
 
 /// The folders that are known, and what checks each.
-const SETS: &[(&str, Check)] = &[("holoassist", holoassist::check), ("egogen", egogen::check)];
+const SETS: &[(&str, Check)] = &[
+    ("nymeria", nymeria::check),
+    ("ego_exo4d", ego_exo4d::check),
+    ("holoassist", holoassist::check),
+    ("egogen", egogen::check),
+];
 
 /// Checks everything below `folder`: one known folder, or a set of them.
 pub fn check(folder: &Path) -> Outcome<Report> {

@@ -47,7 +47,7 @@ impl super::Run for Data {
 /// How clips are cut from recordings.
 #[derive(Debug, Clone, clap::Args)]
 struct Cut {
-    /// What lies there: adt, hot3d_aria, hot3d_quest, holoassist, egogen, aria, neutral, egom2p, video or shards; else what it
+    /// What lies there: adt, hot3d_aria, hot3d_quest, nymeria, ego_exo4d, holoassist, egogen, aria, neutral, egom2p, video or shards; else what it
     /// looks like
     #[arg(long, value_name = "KIND", value_parser = kind)]
     kind: Option<Dataset>,

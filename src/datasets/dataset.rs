@@ -141,6 +141,13 @@ impl Recordings {
         self
     }
 
+    /// Adds what is known to be absent before any recording is opened.
+    #[must_use]
+    pub fn with_note(mut self, note: &str, count: usize) -> Self {
+        *self.notes.entry(note.to_owned()).or_default() += count;
+        self
+    }
+
     /// The folders, in the order of their clips.
     #[must_use]
     pub fn folders(&self) -> &[PathBuf] {

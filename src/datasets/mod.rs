@@ -5,7 +5,7 @@
 //!
 //! * [`recording`]: how a recording is cut into clips, once for all data sets; [`track`]: signals with clocks of their own
 //! * [`aria`]: recordings of Project Aria glasses; [`umetrack`]: hands from joint angles
-//! * one file per data set: [`adt`], [`hot3d`], [`holoassist`], [`egogen`]; [`mps`] (any Aria
+//! * one file per data set: [`adt`], [`hot3d`], [`nymeria`], [`ego_exo4d`], [`holoassist`], [`egogen`]; [`mps`] (any Aria
 //!   recording), [`neutral`] (the folder format that any data set can be written as), [`egom2p`] (the ancestors' layout)
 //! * [`dataset`] (many recordings), [`open`] (whatever a path holds), [`split`] (for training, for the test),
 //!   [`convert`] into [`shards`], which are a source again, [`survey`] (a look at what is there)
@@ -20,12 +20,14 @@ pub mod csv;
 pub mod cut;
 pub mod dataset;
 mod declared;
+pub mod ego_exo4d;
 pub mod egogen;
 pub mod egom2p;
 pub mod holoassist;
 pub mod hot3d;
 pub mod mps;
 pub mod neutral;
+pub mod nymeria;
 pub mod open;
 mod pipeline;
 pub mod recording;

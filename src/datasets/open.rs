@@ -3,7 +3,10 @@
 use super::recording::{ColourFrames, CutSettings, Recording};
 use super::shards::ShardClips;
 use super::track::SECOND;
-use super::{ClipSource, Outcome, ReadError, adt, egogen, egom2p, holoassist, hot3d, mps, neutral};
+use super::{
+    ClipSource, Outcome, ReadError, adt, ego_exo4d, egogen, egom2p, holoassist, hot3d, mps,
+    neutral, nymeria,
+};
 use crate::modality::{ClipFormat, DeclaredSettings};
 use crate::video::image::Image;
 use crate::video::{Video, folder};
@@ -22,6 +25,10 @@ pub enum Dataset {
     Hot3dAria,
     /// HOT3D recordings of Quest 3 headsets.
     Hot3dQuest,
+    /// Nymeria sequences.
+    Nymeria,
+    /// Ego-Exo4D takes.
+    EgoExo4d,
     /// HoloAssist sessions.
     Holoassist,
     /// EgoGen as EgoM2P stores it.
@@ -40,12 +47,14 @@ pub enum Dataset {
 
 impl Dataset {
     /// Every kind, in the order in which a path is tried.
-    pub const ALL: [Dataset; 10] = [
+    pub const ALL: [Dataset; 12] = [
         Dataset::Shards,
         Dataset::Neutral,
         Dataset::Adt,
         Dataset::Hot3dAria,
         Dataset::Hot3dQuest,
+        Dataset::Nymeria,
+        Dataset::EgoExo4d,
         Dataset::Holoassist,
         Dataset::Egogen,
         Dataset::Aria,
@@ -60,6 +69,8 @@ impl Dataset {
             Dataset::Adt => "adt",
             Dataset::Hot3dAria => "hot3d_aria",
             Dataset::Hot3dQuest => "hot3d_quest",
+            Dataset::Nymeria => "nymeria",
+            Dataset::EgoExo4d => "ego_exo4d",
             Dataset::Holoassist => "holoassist",
             Dataset::Egogen => "egogen",
             Dataset::Aria => "aria",
@@ -124,6 +135,8 @@ pub fn open(
         Dataset::Adt => Arc::new(adt::source(path, settings)?.with_declared(declared)),
         Dataset::Hot3dAria => Arc::new(hot3d::aria(path, settings)?.with_declared(declared)),
         Dataset::Hot3dQuest => Arc::new(hot3d::quest(path, settings)?.with_declared(declared)),
+        Dataset::Nymeria => Arc::new(nymeria::source(path, settings)?.with_declared(declared)),
+        Dataset::EgoExo4d => Arc::new(ego_exo4d::source(path, settings)?.with_declared(declared)),
         Dataset::Holoassist => {
             Arc::new(holoassist::source(path, settings)?.with_declared(declared))
         }

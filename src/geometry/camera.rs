@@ -126,6 +126,26 @@ impl Camera {
         }
     }
 
+    /// The camera of the image turned by a quarter clockwise. Its x axis is the old -y, its y axis the old x.
+    #[must_use]
+    pub fn turned_clockwise(&self) -> Camera {
+        let mut lens = self.lens.clone();
+        let below = f64::from(self.height) - 1.0;
+        lens.map_linear(|fx, fy, cx, cy| (fy, fx, below - cy, cx));
+        if let Lens::Fisheye624(fisheye) = &mut lens {
+            let [p0, p1] = fisheye.tangential;
+            let [s0, s1, s2, s3] = fisheye.prism;
+            fisheye.tangential = [-p1, p0];
+            fisheye.prism = [-s2, -s3, s0, s1];
+        }
+        Camera {
+            lens,
+            width: self.height,
+            height: self.width,
+            valid_radius: self.valid_radius,
+        }
+    }
+
     /// The camera of the part of the image that starts at (`left`, `top`).
     #[must_use]
     pub fn cropped(&self, left: f64, top: f64, width: u32, height: u32) -> Camera {
@@ -371,6 +391,18 @@ mod tests {
     }
 
     proptest! {
+        #[test]
+        fn a_turned_camera_sees_the_turned_picture(x in -1.0f64..1.0, y in -1.0f64..1.0) {
+            for camera in [aria_like(), kannala()] {
+                let stored = camera.project(&Vector3::new(x, y, 1.0)).unwrap();
+                let turned = camera.turned_clockwise();
+                let pixel = turned.project(&Vector3::new(-y, x, 1.0)).unwrap();
+                let expected = Vector2::new(f64::from(camera.height) - 1.0 - stored.y, stored.x);
+                prop_assert!((pixel - expected).norm() < 1e-9);
+                prop_assert_eq!((turned.width, turned.height), (camera.height, camera.width));
+            }
+        }
+
         #[test]
         fn unproject_inverts_project(x in -1.0f64..1.0, y in -1.0f64..1.0, depth in 0.1f64..20.0) {
             let pinhole = Camera {

@@ -44,7 +44,12 @@ impl Recording {
             return Ok(Err(missing));
         };
         let period = (end - colour.times()[0]) / colour.times().len().max(1) as i64;
-        let tolerance = period * 3 / 4 + SECOND / 1000;
+        let tolerance = match missing {
+            // Frames without depth of their own moment are not replaced by others.
+            DropReason::DepthApart => period * 3 / 4 + SECOND / 1000,
+            // One lost picture is: its neighbour stands in for it.
+            _ => period + SECOND / 500,
+        };
         let mut chosen = Vec::with_capacity(settings.frames());
         for k in 0..settings.frames() {
             let tick = start + (k as f64 / settings.fps * SECOND as f64).round() as i64;
