@@ -29,6 +29,8 @@ pub struct Answer {
     pub valid: Option<&'static str>,
     /// Samples that a reader may call valid beyond those, with whatever value.
     pub may_be_valid: Option<&'static str>,
+    /// Which of the array's joints are ours, where it has more.
+    pub joints: Option<&'static [usize]>,
     pub tolerance: f64,
 }
 
@@ -38,6 +40,7 @@ impl Answer {
             values,
             valid: Some(valid),
             may_be_valid: None,
+            joints: None,
             tolerance,
         }
     }
@@ -415,11 +418,15 @@ fn beside(
             Ok(clip.iter().copied().collect())
         };
         let values = golden.array::<f64, ndarray::IxDyn>(answer.values)?;
-        let values: Vec<f64> = values
-            .index_axis(ndarray::Axis(0), index)
-            .iter()
-            .copied()
-            .collect();
+        let values = values.index_axis(ndarray::Axis(0), index);
+        let values: Vec<f64> = match answer.joints {
+            Some(joints) => values
+                .select(ndarray::Axis(1), joints)
+                .iter()
+                .copied()
+                .collect(),
+            None => values.iter().copied().collect(),
+        };
         let values = Array3::from_shape_vec(shape, values)?;
         let valid = match answer.valid {
             Some(key) => flags(key)?,
