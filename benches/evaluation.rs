@@ -4,7 +4,7 @@
 use nalgebra::{Isometry3, Translation3, UnitQuaternion};
 use ndarray::{Array2, Array3};
 use rand::RngExt;
-use reviv::clip::{CameraTrack, Clip, JointTrack};
+use reviv::clip::{BODY, CAMERA, CameraTrack, Clip, JointTrack};
 use reviv::evaluation::evaluate::{LoadError, Pairs, evaluate};
 use reviv::evaluation::folders::Folders;
 use reviv::evaluation::suite::Suite;
@@ -42,18 +42,24 @@ fn clip(index: usize, noise: &str) -> Clip {
             Isometry3::from_parts(Translation3::new(0.05 * f64::from(i), next(), next()), turn)
         })
         .collect();
-    clip.camera = Some(CameraTrack {
-        rate: 30.0,
-        T_world_camera: poses,
-        valid: vec![true; 60],
-        up_world: None,
-        intrinsics: None,
-    });
-    clip.body = Some(JointTrack {
-        rate: 30.0,
-        joints: Array3::from_shape_fn((60, 21, 3), |_| next() as f32),
-        valid: Array2::from_elem((60, 21), true),
-    });
+    clip.set(
+        CAMERA,
+        CameraTrack {
+            rate: 30.0,
+            T_world_camera: poses,
+            valid: vec![true; 60],
+            up_world: None,
+            intrinsics: None,
+        },
+    );
+    clip.set(
+        BODY,
+        JointTrack {
+            rate: 30.0,
+            joints: Array3::from_shape_fn((60, 21, 3), |_| next() as f32),
+            valid: Array2::from_elem((60, 21), true),
+        },
+    );
     clip
 }
 

@@ -168,6 +168,6 @@ fn decode(folder: &Path) {
     for (name, confidence) in &made[0].confidence {
         println!("{name}: {} samples", confidence.len());
     }
-    assert!(made[0].clip.body.is_some() && made[0].clip.camera.is_some());
+    assert!(made[0].clip.body().is_some() && made[0].clip.camera().is_some());
     println!("decoded a clip in {:.1} s", start.elapsed().as_secs_f64());
 }

@@ -14,7 +14,7 @@ fn main() {
         let mut checksum = 0u64;
         for index in 0..clips {
             let clip = world.clip(index);
-            let rgb = clip.rgb.expect("the world renders colour");
+            let rgb = clip.rgb().expect("the world renders colour");
             checksum = rgb.frames.iter().fold(checksum, |a, b| {
                 a.wrapping_mul(31).wrapping_add(u64::from(*b))
             });

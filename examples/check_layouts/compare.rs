@@ -7,7 +7,7 @@ use std::path::Path;
 use std::sync::Arc;
 
 use ndarray::{Array1, Array2, Array3, Ix1, Ix2, Ix4, Ix5, s};
-use reviv::clip::{Clip, JointTrack, Rgb};
+use reviv::clip::{Clip, JointTrack, Key, Rgb};
 use reviv::datasets::recording::CutSettings;
 use reviv::datasets::{ClipSource, Outcome as Cut, ReadError};
 
@@ -180,9 +180,7 @@ fn code(rgb: &Rgb, frame: usize) -> Option<i64> {
 }
 
 fn rgb(clip: &Clip) -> Outcome<&Rgb> {
-    clip.rgb
-        .as_ref()
-        .ok_or_else(|| "a clip has no pictures".into())
+    clip.rgb().ok_or_else(|| "a clip has no pictures".into())
 }
 
 /// Which pictures were chosen, by the numbers in their pixels.
@@ -255,7 +253,7 @@ fn cells(golden: &Golden, clips: &[Clip], expected: &Expected, report: &mut Repo
 
 fn depth(golden: &Golden, clips: &[Clip], expected: &Expected, report: &mut Report) -> Outcome {
     if !golden.has("depth_cells8") {
-        if clips.iter().any(|clip| clip.depth.is_some()) {
+        if clips.iter().any(|clip| clip.depth().is_some()) {
             report.problem(
                 &format!("{} depth", golden.name),
                 "depth where there is none",
@@ -266,7 +264,7 @@ fn depth(golden: &Golden, clips: &[Clip], expected: &Expected, report: &mut Repo
     let metres = golden.array::<f64, Ix4>("depth_cells8")?;
     let (mut worst, mut wrong) = (0.0_f64, 0);
     for (clip, metres) in clips.iter().zip(metres.outer_iter()) {
-        let found = &clip.depth.as_ref().ok_or("a clip has no depth")?.metres;
+        let found = &clip.depth().ok_or("a clip has no depth")?.metres;
         let side = found.shape()[1] / CELLS;
         for ((frame, row, column), wanted) in metres.indexed_iter() {
             let at = [frame, row * side + side / 2, column * side + side / 2];
@@ -298,7 +296,7 @@ fn camera(golden: &Golden, clips: &[Clip], expected: &Expected, report: &mut Rep
         .transpose()?;
     let (mut worst, mut wrong, mut up_off) = (0.0_f64, 0, 0.0_f64);
     for (index, clip) in clips.iter().enumerate() {
-        let track = clip.camera.as_ref().ok_or("a clip has no camera")?;
+        let track = clip.camera().ok_or("a clip has no camera")?;
         for k in 0..valid.ncols() {
             wrong += usize::from(track.valid[k] != valid[[index, k]]);
             if !(track.valid[k] && valid[[index, k]]) {
@@ -335,13 +333,9 @@ fn camera(golden: &Golden, clips: &[Clip], expected: &Expected, report: &mut Rep
 
 /// A signal of a clip as `[samples, parts, channels]` with validity `[samples, parts]`.
 fn parts(clip: &Clip, name: &str) -> Option<(Array3<f64>, Array2<bool>)> {
-    let joints = |track: &Option<JointTrack>| {
-        let track = track.as_ref()?;
-        Some((track.joints.mapv(f64::from), track.valid.clone()))
-    };
     match name {
         "gaze" => {
-            let track = clip.gaze.as_ref()?;
+            let track = clip.gaze()?;
             let samples = track.valid.len();
             let points = track.points.mapv(f64::from);
             Some((
@@ -353,9 +347,10 @@ fn parts(clip: &Clip, name: &str) -> Option<(Array3<f64>, Array2<bool>)> {
                     .ok()?,
             ))
         }
-        "left_hand" => joints(&clip.left_hand),
-        "right_hand" => joints(&clip.right_hand),
-        _ => joints(&clip.body),
+        name => {
+            let track = clip.get(Key::<JointTrack>::new(name))?;
+            Some((track.joints.mapv(f64::from), track.valid.clone()))
+        }
     }
 }
 

@@ -232,18 +232,10 @@ mod tests {
                     reason: DropReason::DepthApart,
                 });
             }
-            Ok(Outcome::Clip(Box::new(Clip {
-                id: index.to_string(),
-                source: "numbers".to_owned(),
-                rgb: None,
-                depth: None,
-                camera: None,
-                gaze: None,
-                left_hand: None,
-                right_hand: None,
-                body: None,
-                declared: BTreeMap::new(),
-            })))
+            Ok(Outcome::Clip(Box::new(Clip::empty(
+                index.to_string(),
+                "numbers",
+            ))))
         }
     }
 

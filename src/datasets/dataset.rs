@@ -3,7 +3,7 @@
 use super::declared::DeclaredTrack;
 use super::recording::{CutSettings, Recording};
 use super::{ClipSource, Excluded, Outcome, ReadError};
-use crate::modality::{BUILT_IN, ClipFormat, DeclaredSettings};
+use crate::modality::{BUILT_IN, ClipFormat, DeclaredSettings, put};
 use rayon::prelude::*;
 use std::collections::BTreeMap;
 use std::ops::Range;
@@ -230,10 +230,12 @@ impl ClipSource for Recordings {
         let (recording, declared) = &*self.recording(number)?;
         let inside = index - self.starts[number];
         let mut outcome = recording.clip(inside, &self.settings)?;
+        let format = self.format().unwrap_or_default();
         if let Outcome::Clip(clip) = &mut outcome {
             for track in declared {
                 let signal = track.clip(inside as f64 * self.settings.stride);
-                clip.declared.insert(track.name.clone(), signal);
+                put(&track.settings, &format, signal, clip)
+                    .map_err(|error| ReadError::Settings(error.to_string()))?;
             }
         }
         Ok(outcome)

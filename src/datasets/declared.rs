@@ -12,9 +12,7 @@ use std::path::Path;
 
 /// One declared signal of one recording.
 pub(super) struct DeclaredTrack {
-    pub name: String,
-    /// Hz.
-    rate: f64,
+    pub settings: DeclaredSettings,
     /// `[samples, channels]`, NaN where missing.
     values: Array2<f32>,
 }
@@ -52,16 +50,15 @@ impl DeclaredTrack {
             return wrong(format!("`{key}`, row {row}: a value that is not finite"));
         }
         Ok(Some(DeclaredTrack {
-            name: settings.name.clone(),
-            rate: settings.signal.rate,
+            settings: settings.clone(),
             values,
         }))
     }
 
     /// The two seconds from `start` on, seconds from the recording's first moment; what lies beyond the end is invalid.
     pub fn clip(&self, start: f64) -> Signal {
-        let samples = (CLIP_SECONDS * self.rate).round_ties_even() as usize;
-        let first = (start * self.rate).round() as usize;
+        let samples = (CLIP_SECONDS * self.settings.signal.rate).round_ties_even() as usize;
+        let first = (start * self.settings.signal.rate).round() as usize;
         let values = Array2::from_shape_fn((samples, self.values.ncols()), |(k, channel)| {
             let row = first.saturating_add(k);
             self.values.get((row, channel)).copied().unwrap_or(f32::NAN)

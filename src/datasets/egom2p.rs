@@ -9,7 +9,7 @@ use super::open::Frames;
 use super::recording::{CutSettings, GazeSample, JointFrame, MountedCamera, Recording};
 use super::track::{Joints, SECOND, Track};
 use super::{ClipSource, Outcome, ReadError};
-use crate::clip::Depth;
+use crate::clip::{DEPTH, Depth};
 use crate::formats::npy::{self, NpyArray};
 use crate::formats::npz::Npz;
 use crate::formats::read_error::Position;
@@ -263,7 +263,7 @@ impl ClipSource for Arrays {
         };
         clip.id = format!("{}/{name}", self.dataset);
         if let Some(path) = files.get("depth") {
-            clip.depth = Some(metric_depth(path, &self.settings)?);
+            clip.set(DEPTH, metric_depth(path, &self.settings)?);
         }
         Ok(Outcome::Clip(clip))
     }

@@ -18,13 +18,12 @@ use super::track::{Joints, SECOND, Track, nearest};
 use super::{DropReason, Outcome};
 use crate::clip::clock::{CLIP_SECONDS, SIGNAL_RATE, SIGNAL_SAMPLES};
 use crate::clip::frames::{gravity_frame_of, joints_in_camera, joints_in_frame};
-use crate::clip::{Clip, JointTrack};
+use crate::clip::{BODY, CAMERA, Clip, DEPTH, GAZE, JointTrack, LEFT_HAND, RGB, RIGHT_HAND};
 use crate::geometry::camera::{Camera, KannalaBrandt, Lens};
 use crate::geometry::undistortion::Remap;
 use crate::video::image::{Image, Turn};
 use nalgebra::{Isometry3, Rotation3, Unit, UnitQuaternion, Vector3};
 use ndarray::Array2;
-use std::collections::BTreeMap;
 use std::sync::{Arc, OnceLock};
 
 /// Colour and depth farther apart than this do not show the same moment (the paper's rule).
@@ -349,18 +348,15 @@ impl Recording {
                 reason: DropReason::NothingValid,
             });
         }
-        Ok(Outcome::Clip(Box::new(Clip {
-            id,
-            source: self.source.clone(),
-            rgb,
-            depth,
-            camera,
-            gaze,
-            left_hand,
-            right_hand,
-            body,
-            declared: BTreeMap::new(),
-        })))
+        let mut clip = Clip::empty(id, self.source.clone());
+        clip.set(RGB, rgb);
+        clip.set(DEPTH, depth);
+        clip.set(CAMERA, camera);
+        clip.set(GAZE, gaze);
+        clip.set(LEFT_HAND, left_hand);
+        clip.set(RIGHT_HAND, right_hand);
+        clip.set(BODY, body);
+        Ok(Outcome::Clip(Box::new(clip)))
     }
 }
 

@@ -146,6 +146,6 @@ mod tests {
             .map(|clip| clip.id.as_str())
             .collect();
         assert_eq!(ids, ["world/000000", "world/000020"]);
-        assert!(survey.examples[0].rgb.is_some());
+        assert!(survey.examples[0].rgb().is_some());
     }
 }

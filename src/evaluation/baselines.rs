@@ -2,18 +2,21 @@
 
 use super::columns::{Column, declared};
 use super::evaluate::{CHUNK, EvaluationError, Pairs};
-use crate::clip::{Clip, Depth, GazeTrack, JointTrack, Signal};
+use crate::clip::{
+    BODY, Clip, DEPTH, Depth, GAZE, GazeTrack, JointTrack, Key, LEFT_HAND, RIGHT_HAND, Signal,
+};
 use ndarray::{Array2, Array3, ArrayD, ArrayView3};
 use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
 
 pub(super) fn image_centre(truth: &Clip) -> Clip {
     let mut clip = Clip::empty(truth.id.clone(), truth.source.clone());
-    clip.gaze = truth.gaze.as_ref().map(|gaze| GazeTrack {
+    let centre = |gaze: &GazeTrack| GazeTrack {
         rate: gaze.rate,
         points: Array2::from_elem(gaze.points.raw_dim(), 0.5),
         valid: gaze.valid.clone(),
-    });
+    };
+    clip.set(GAZE, truth.gaze().map(centre));
     clip
 }
 
@@ -105,20 +108,20 @@ impl Means {
                     let mut part = Self::default();
                     if poses {
                         for (mean, track) in [
-                            (&mut part.body, &clip.body),
-                            (&mut part.left, &clip.left_hand),
-                            (&mut part.right, &clip.right_hand),
+                            (&mut part.body, clip.body()),
+                            (&mut part.left, clip.left_hand()),
+                            (&mut part.right, clip.right_hand()),
                         ] {
                             if let Some(track) = track {
                                 mean.add(track.joints.view(), |t, j| track.valid[(t, j)]);
                             }
                         }
                     }
-                    if let Some(depth) = clip.depth.as_ref().filter(|_| depth) {
+                    if let Some(depth) = clip.depth().filter(|_| depth) {
                         part.depth.add(depth.metres.view(), |_, _| true);
                     }
                     for name in &signals {
-                        if let Some(signal) = clip.declared.get(*name) {
+                        if let Some(signal) = clip.signal(name) {
                             part.add_declared(name, signal);
                         }
                     }
@@ -158,7 +161,7 @@ impl Means {
     pub(super) fn declared(&self, truth: &Clip) -> Clip {
         let mut clip = Clip::empty(truth.id.clone(), truth.source.clone());
         for (name, mean) in &self.declared {
-            let (Some(signal), Some(mean)) = (truth.declared.get(name), mean.value()) else {
+            let (Some(signal), Some(mean)) = (truth.signal(name), mean.value()) else {
                 continue;
             };
             if signal.values.ndim() == 2 && signal.values.shape()[1] == mean.ncols() {
@@ -168,15 +171,15 @@ impl Means {
                     values,
                     valid: None,
                 };
-                clip.declared.insert(name.clone(), signal);
+                clip.set(Key::new(name), signal);
             }
         }
         clip
     }
 
     pub(super) fn pose(&self, truth: &Clip) -> Clip {
-        let track = |track: &Option<JointTrack>, mean: &Mean<Array2<f64>>| {
-            let (track, mean) = (track.as_ref()?, mean.value()?);
+        let track = |track: Option<&JointTrack>, mean: &Mean<Array2<f64>>| {
+            let (track, mean) = (track?, mean.value()?);
             let same = track.joints.dim().1 == mean.nrows() && track.joints.dim().2 == mean.ncols();
             same.then(|| JointTrack {
                 joints: Array3::from_shape_fn(track.joints.dim(), |(_, j, axis)| {
@@ -186,23 +189,26 @@ impl Means {
             })
         };
         let mut clip = Clip::empty(truth.id.clone(), truth.source.clone());
-        clip.body = track(&truth.body, &self.body);
-        clip.left_hand = track(&truth.left_hand, &self.left);
-        clip.right_hand = track(&truth.right_hand, &self.right);
+        clip.set(BODY, track(truth.body(), &self.body));
+        clip.set(LEFT_HAND, track(truth.left_hand(), &self.left));
+        clip.set(RIGHT_HAND, track(truth.right_hand(), &self.right));
         clip
     }
 
     pub(super) fn depth(&self, truth: &Clip) -> Clip {
         let mut clip = Clip::empty(truth.id.clone(), truth.source.clone());
-        if let (Some(depth), Some(mean)) = (&truth.depth, self.depth.value()) {
+        if let (Some(depth), Some(mean)) = (truth.depth(), self.depth.value()) {
             let (_, h, w) = depth.metres.dim();
             if mean.dim() == (h, w) {
-                clip.depth = Some(Depth {
-                    rate: depth.rate,
-                    metres: Array3::from_shape_fn(depth.metres.dim(), |(_, y, x)| {
-                        mean[(y, x)] as f32
-                    }),
-                });
+                clip.set(
+                    DEPTH,
+                    Depth {
+                        rate: depth.rate,
+                        metres: Array3::from_shape_fn(depth.metres.dim(), |(_, y, x)| {
+                            mean[(y, x)] as f32
+                        }),
+                    },
+                );
             }
         }
         clip

@@ -357,7 +357,7 @@ fn without_empty(mut set: ScoreSet) -> ScoreSet {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::clip::{CameraTrack, Depth, GazeTrack, JointTrack};
+    use crate::clip::{BODY, CAMERA, CameraTrack, DEPTH, Depth, GAZE, GazeTrack, JointTrack};
     use nalgebra::{Isometry3, Translation3, UnitQuaternion};
     use ndarray::Array3;
     use rand::RngExt;
@@ -396,27 +396,41 @@ mod tests {
                     )
                 })
                 .collect();
-            clip.camera = Some(CameraTrack {
-                rate: 30.0,
-                T_world_camera: poses,
-                valid: vec![true; 60],
-                up_world: None,
-                intrinsics: None,
-            });
-            clip.body = Some(JointTrack {
-                rate: 30.0,
-                joints: Array3::from_shape_fn((60, 21, 3), |_| next() as f32),
-                valid: Array2::from_shape_fn((60, 21), |at| at != (0, 0) || (self.joint)(index)),
-            });
-            clip.gaze = Some(GazeTrack {
-                rate: 30.0,
-                points: Array2::from_shape_fn((60, 2), |_| next() as f32),
-                valid: Array1::from_elem(60, true),
-            });
-            clip.depth = Some(Depth {
-                rate: 8.0,
-                metres: Array3::from_shape_fn((16, 4, 4), |_| 1.0 + next() as f32),
-            });
+            clip.set(
+                CAMERA,
+                CameraTrack {
+                    rate: 30.0,
+                    T_world_camera: poses,
+                    valid: vec![true; 60],
+                    up_world: None,
+                    intrinsics: None,
+                },
+            );
+            clip.set(
+                BODY,
+                JointTrack {
+                    rate: 30.0,
+                    joints: Array3::from_shape_fn((60, 21, 3), |_| next() as f32),
+                    valid: Array2::from_shape_fn((60, 21), |at| {
+                        at != (0, 0) || (self.joint)(index)
+                    }),
+                },
+            );
+            clip.set(
+                GAZE,
+                GazeTrack {
+                    rate: 30.0,
+                    points: Array2::from_shape_fn((60, 2), |_| next() as f32),
+                    valid: Array1::from_elem(60, true),
+                },
+            );
+            clip.set(
+                DEPTH,
+                Depth {
+                    rate: 8.0,
+                    metres: Array3::from_shape_fn((16, 4, 4), |_| 1.0 + next() as f32),
+                },
+            );
             clip
         }
     }

@@ -49,50 +49,50 @@ pub(crate) fn score_clip(
         missing,
         "body",
         wanted(&["body"]),
-        &truth.body,
-        &prediction.body,
+        truth.body(),
+        prediction.body(),
     );
     let left = both(
         missing,
         "left_hand",
         hands("left_hand"),
-        &truth.left_hand,
-        &prediction.left_hand,
+        truth.left_hand(),
+        prediction.left_hand(),
     );
     let right = both(
         missing,
         "right_hand",
         hands("right_hand"),
-        &truth.right_hand,
-        &prediction.right_hand,
+        truth.right_hand(),
+        prediction.right_hand(),
     );
     let camera = both(
         missing,
         "camera",
         wanted(&["camera"]),
-        &truth.camera,
-        &prediction.camera,
+        truth.camera(),
+        prediction.camera(),
     );
     let gaze = both(
         missing,
         "gaze",
         wanted(&["gaze"]),
-        &truth.gaze,
-        &prediction.gaze,
+        truth.gaze(),
+        prediction.gaze(),
     );
     let depth = both(
         missing,
         "depth",
         wanted(&["depth"]),
-        &truth.depth,
-        &prediction.depth,
+        truth.depth(),
+        prediction.depth(),
     );
     let rgb = both(
         missing,
         "rgb",
         wanted(&["rgb"]),
-        &truth.rgb,
-        &prediction.rgb,
+        truth.rgb(),
+        prediction.rgb(),
     );
 
     if let Some((truth, prediction)) = body
@@ -120,12 +120,12 @@ pub(crate) fn score_clip(
 
     // Compat counts a hand without a visible frame as 0.0; one that is visible and was not predicted is no such hand.
     let lacks_hand = [
-        (&truth.left_hand, &prediction.left_hand),
-        (&truth.right_hand, &prediction.right_hand),
+        (truth.left_hand(), prediction.left_hand()),
+        (truth.right_hand(), prediction.right_hand()),
     ]
     .into_iter()
     .any(|(truth, prediction)| {
-        let visible = truth.as_ref().is_some_and(|t| t.valid.iter().any(|v| *v));
+        let visible = truth.is_some_and(|t| t.valid.iter().any(|v| *v));
         visible && prediction.is_none()
     });
     score.values = columns
@@ -155,8 +155,7 @@ pub(crate) fn score_clip(
         })
         .collect();
     for (value, column) in score.values.iter_mut().zip(columns) {
-        let signals =
-            declared(&column.name).map(|m| (truth.declared.get(m), prediction.declared.get(m)));
+        let signals = declared(&column.name).map(|m| (truth.signal(m), prediction.signal(m)));
         if let Some((Some(truth), Some(prediction))) = signals {
             *value = Outcome::of(declared_rmse(truth, prediction)?);
         }
@@ -171,14 +170,14 @@ fn both<'a, T>(
     missing: &mut Vec<&'static str>,
     modality: &'static str,
     wanted: bool,
-    truth: &'a Option<T>,
-    prediction: &'a Option<T>,
+    truth: Option<&'a T>,
+    prediction: Option<&'a T>,
 ) -> Option<(&'a T, &'a T)> {
-    let truth = truth.as_ref().filter(|_| wanted)?;
+    let truth = truth.filter(|_| wanted)?;
     if prediction.is_none() {
         missing.push(modality);
     }
-    Some((truth, prediction.as_ref()?))
+    Some((truth, prediction?))
 }
 
 fn track_errors(
@@ -290,7 +289,7 @@ impl CameraScore {
 
 /// RTE and RRE of a camera that never moves, on the true trajectory; degenerate where the truth is.
 pub(crate) fn still_camera(columns: &[Column], truth: &Clip) -> Result<Vec<Outcome>, MetricError> {
-    let errors = match &truth.camera {
+    let errors = match truth.camera() {
         None => TrajectoryErrors::default(),
         Some(track) => {
             let poses: Vec<Pose> = track
@@ -433,6 +432,7 @@ fn declared_rmse(truth: &Signal, prediction: &Signal) -> Result<Option<f64>, Met
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::clip::{CAMERA, LEFT_HAND, RIGHT_HAND};
     use ndarray::Array2;
 
     fn clip(poses: usize, rate: f64) -> Clip {
@@ -441,19 +441,22 @@ mod tests {
             let t = i as f64 / rate;
             rigid::Rigid::translation(t, (7.0 * t).sin(), (3.0 * t).cos())
         };
-        clip.camera = Some(CameraTrack {
-            rate,
-            T_world_camera: (0..poses).map(pose).collect(),
-            valid: vec![true; poses],
-            up_world: None,
-            intrinsics: None,
-        });
+        clip.set(
+            CAMERA,
+            CameraTrack {
+                rate,
+                T_world_camera: (0..poses).map(pose).collect(),
+                valid: vec![true; poses],
+                up_world: None,
+                intrinsics: None,
+            },
+        );
         clip
     }
 
     fn lose(clip: &mut Clip, index: usize) {
         let lost = rigid::Rigid::translation(f64::NAN, f64::NAN, f64::NAN);
-        clip.camera.as_mut().unwrap().T_world_camera[index] = lost;
+        clip.get_mut(CAMERA).unwrap().T_world_camera[index] = lost;
     }
 
     #[test]
@@ -461,7 +464,7 @@ mod tests {
         let columns = ["camera.ate", "camera.rre", "camera.position"];
         let columns = columns.map(|name| Column::named(name).unwrap());
         let mut truth = clip(60, 30.0);
-        truth.camera.as_mut().unwrap().valid[20] = false;
+        truth.get_mut(CAMERA).unwrap().valid[20] = false;
         let score = |truth: &Clip, prediction: &Clip| score_clip(&columns, None, truth, prediction);
         let mut prediction = clip(60, 30.0);
         let whole = score(&truth, &prediction).unwrap().values;
@@ -476,7 +479,7 @@ mod tests {
         let mut prediction = clip(30, 15.0);
         lose(&mut prediction, 10);
         assert!(score(&truth, &prediction).is_err());
-        truth.camera.as_mut().unwrap().valid[19..=21].fill(false);
+        truth.get_mut(CAMERA).unwrap().valid[19..=21].fill(false);
         let scored = score(&truth, &prediction).unwrap();
         assert!(scored.resampled && scored.values.iter().all(|v| v.number().is_some()));
     }
@@ -497,9 +500,10 @@ mod tests {
         };
         let values = |seen: bool, predicted: bool| {
             let (mut truth, mut prediction) = (clip(4, 30.0), clip(4, 30.0));
-            (truth.left_hand, truth.right_hand) = (track(0.0, true), track(0.0, seen));
-            prediction.left_hand = track(0.1, true);
-            prediction.right_hand = track(0.1, true).filter(|_| predicted);
+            truth.set(LEFT_HAND, track(0.0, true));
+            truth.set(RIGHT_HAND, track(0.0, seen));
+            prediction.set(LEFT_HAND, track(0.1, true));
+            prediction.set(RIGHT_HAND, track(0.1, true).filter(|_| predicted));
             let found = score_clip(&columns, None, &truth, &prediction).unwrap();
             [found.values[0].number(), found.values[1].number()]
                 .map(|value| value.map(|v| (v * 10.0).round() / 10.0))

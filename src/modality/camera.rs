@@ -1,7 +1,7 @@
 //! The camera trajectory as 60 x 9: poses relative to the first, two rotation columns then translation.
 
 use super::{ClipFormat, Modality, ModalityError, Shape, expect_shape};
-use crate::clip::{CameraTrack, Clip, Signal};
+use crate::clip::{CAMERA, CameraTrack, Clip, Signal};
 use crate::geometry::{rigid, rotation};
 use nalgebra::Isometry3;
 use ndarray::{Array1, Array2};
@@ -68,7 +68,7 @@ impl Modality for Camera {
     }
 
     fn extract(&self, clip: &Clip) -> Result<Option<Signal>, ModalityError> {
-        let Some(camera) = &clip.camera else {
+        let Some(camera) = clip.camera() else {
             return Ok(None);
         };
         expect_shape(
@@ -114,7 +114,7 @@ impl Modality for Camera {
             signal.values.shape(),
             &[self.samples, CHANNELS],
         )?;
-        let before = clip.camera.take();
+        let before = clip.take(CAMERA);
         let first = before
             .as_ref()
             .and_then(|c| c.T_world_camera.first().copied())
@@ -128,13 +128,14 @@ impl Modality for Camera {
             valid[t] = pose.is_some();
             poses.push(pose.map_or(first, |p| first * p));
         }
-        clip.camera = Some(CameraTrack {
+        let track = CameraTrack {
             rate: self.rate,
             T_world_camera: poses,
             valid,
             up_world: before.as_ref().and_then(|c| c.up_world),
             intrinsics: before.and_then(|c| c.intrinsics),
-        });
+        };
+        clip.set(CAMERA, track);
         Ok(())
     }
 }
@@ -146,7 +147,7 @@ mod tests {
 
     fn clip(samples: usize) -> Clip {
         let mut clip = Clip::empty("a", "test");
-        clip.camera = Some(CameraTrack {
+        let track = CameraTrack {
             rate: 30.0,
             T_world_camera: (0..samples)
                 .map(|t| {
@@ -160,7 +161,8 @@ mod tests {
             valid: vec![true; samples],
             up_world: Some(Vector3::z_axis()),
             intrinsics: None,
-        });
+        };
+        clip.set(CAMERA, track);
         clip
     }
 
@@ -178,7 +180,7 @@ mod tests {
         }
         let mut back = clip.clone();
         camera.insert(signal, &mut back).unwrap();
-        let (a, b) = (clip.camera.unwrap(), back.camera.unwrap());
+        let (a, b) = (clip.camera().unwrap(), back.camera().unwrap());
         for (a, b) in a.T_world_camera.iter().zip(&b.T_world_camera) {
             assert!((a.translation.vector - b.translation.vector).norm() < 1e-5);
             assert!(a.rotation.angle_to(&b.rotation) < 1e-5);
@@ -189,14 +191,14 @@ mod tests {
     fn gaps_stay_gaps_and_a_missing_start_is_refused() {
         let camera = Camera::new(&ClipFormat::default());
         let mut clip = clip(60);
-        clip.camera.as_mut().unwrap().valid[7] = false;
+        clip.get_mut(CAMERA).unwrap().valid[7] = false;
         let signal = camera.extract(&clip).unwrap().unwrap();
         assert!(!signal.valid.as_ref().unwrap()[[7]]);
         camera.insert(signal, &mut clip).unwrap();
-        assert!(!clip.camera.as_ref().unwrap().valid[7]);
-        clip.camera.as_mut().unwrap().valid[0] = false;
+        assert!(!clip.camera().unwrap().valid[7]);
+        clip.get_mut(CAMERA).unwrap().valid[0] = false;
         assert!(camera.extract(&clip).is_err());
-        clip.camera.as_mut().unwrap().valid = vec![false; 60];
+        clip.get_mut(CAMERA).unwrap().valid = vec![false; 60];
         assert!(camera.extract(&clip).unwrap().is_none());
     }
 }

@@ -1,9 +1,9 @@
 //! Modalities whose values a plug-in crate computes: [`SignalCode`], linked in and named by `source: {code: NAME}`.
 //!
-//! The code runs once per clip, when clips are made. From there on the values travel in [`Clip::declared`], so that everything
+//! The code runs once per clip, when clips are made. From there on the values travel in the clip, so that everything
 //! after it (tokenizers, masking, MGET, decoding, metrics) treats the modality like any declared one.
 
-use super::{ClipFormat, Declared, DeclaredSettings, Modality as _, ModalityError};
+use super::{ClipFormat, DeclaredSettings, ModalityError};
 use crate::clip::{Clip, Signal};
 
 /// Computes the values of a declared modality from a clip's other signals; `None` where the clip lacks what it needs.
@@ -54,7 +54,7 @@ pub fn fill(clip: &mut Clip, format: &ClipFormat) -> Result<(), ModalityError> {
             reason: format!("no code `{name}` is linked into this binary"),
         })?;
         if let Some(signal) = (code.derive)(clip, settings)? {
-            Declared::new(settings.clone(), format).insert(signal, clip)?;
+            super::put(settings, format, signal, clip)?;
         }
     }
     Ok(())

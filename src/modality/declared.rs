@@ -1,9 +1,9 @@
 //! Modalities declared in YAML: a new sensor in one registry file, no Rust.
 //!
-//! The values travel in [`Clip::declared`] under the modality's name, `[samples, channels]`.
+//! The values travel in the clip under the modality's name, `[samples, channels]`.
 
 use super::{ClipFormat, Modality, ModalityError, Shape, expect_shape};
-use crate::clip::{Clip, Signal};
+use crate::clip::{Clip, Key, Signal};
 use ndarray::ArrayD;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -165,7 +165,7 @@ impl Modality for Declared {
     }
 
     fn extract(&self, clip: &Clip) -> Result<Option<Signal>, ModalityError> {
-        let Some(signal) = clip.declared.get(self.name()) else {
+        let Some(signal) = clip.signal(self.name()) else {
             return Ok(None);
         };
         expect_shape(
@@ -213,7 +213,7 @@ impl Modality for Declared {
             signal.values.shape(),
             &self.expected(),
         )?;
-        clip.declared.insert(self.name().to_owned(), signal);
+        clip.set(Key::new(self.name()), signal);
         Ok(())
     }
 }

@@ -48,11 +48,10 @@ impl ClipFormat {
     pub fn of(clip: &Clip) -> Self {
         let mut format = Self::default();
         let video = clip
-            .rgb
-            .as_ref()
+            .rgb()
             .map(|rgb| (rgb.rate, [rgb.frames.shape()[0], rgb.frames.shape()[1]]))
             .or_else(|| {
-                let depth = clip.depth.as_ref()?;
+                let depth = clip.depth()?;
                 Some((
                     depth.rate,
                     [depth.metres.shape()[0], depth.metres.shape()[1]],
@@ -61,12 +60,12 @@ impl ClipFormat {
         if let Some((rate, [frames, size])) = video {
             (format.video_rate, format.frames, format.size) = (rate, frames, size);
         }
-        for (name, signal) in &clip.declared {
+        for (name, signal) in clip.signals() {
             let &[samples, channels] = signal.values.shape() else {
                 continue;
             };
             format.declared.push(DeclaredSettings {
-                name: name.clone(),
+                name: name.to_owned(),
                 about: String::new(),
                 signal: SignalSettings {
                     rate: samples as f64 / clock::CLIP_SECONDS,

@@ -1,7 +1,7 @@
 //! Gaze as a point of the upright square image over time, 60 x 2.
 
 use super::{ClipFormat, Modality, ModalityError, Shape, expect_shape};
-use crate::clip::{Clip, GazeTrack, Signal};
+use crate::clip::{Clip, GAZE, GazeTrack, Signal};
 use ndarray::{Array1, Array2, Ix1, Ix2};
 
 /// A point further outside the image than this is invalid.
@@ -54,7 +54,7 @@ impl Modality for Gaze {
     }
 
     fn extract(&self, clip: &Clip) -> Result<Option<Signal>, ModalityError> {
-        let Some(gaze) = &clip.gaze else {
+        let Some(gaze) = clip.gaze() else {
             return Ok(None);
         };
         expect_shape(
@@ -99,11 +99,15 @@ impl Modality for Gaze {
             }
             None => Array1::from_elem(self.samples, true),
         };
-        clip.gaze = Some(GazeTrack {
-            rate: self.rate,
-            points,
-            valid,
-        });
+        let rate = self.rate;
+        clip.set(
+            GAZE,
+            GazeTrack {
+                rate,
+                points,
+                valid,
+            },
+        );
         Ok(())
     }
 }
@@ -125,7 +129,7 @@ mod tests {
         track.points[[5, 1]] = 1.3;
         track.points[[6, 0]] = -0.1;
         track.points[[7, 0]] = f32::NAN;
-        clip.gaze = Some(track);
+        clip.set(GAZE, track);
         let signal = gaze.extract(&clip).unwrap().unwrap();
         let valid = signal.valid.clone().unwrap();
         let invalid: Vec<usize> = (0..60).filter(|t| !valid[[*t]]).collect();

@@ -2,9 +2,8 @@
 //! channel in its unit. Colour is counted in levels of 0 to 255 and depth in metres, everything else as its modality has it.
 
 use super::{ClipFormat, Modality, all};
+use crate::clip::Clip;
 use crate::clip::statistics::SignalStatistics;
-use crate::clip::{Clip, Signal};
-use ndarray::Axis;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -104,20 +103,16 @@ pub fn count(clip: &Clip, format: &ClipFormat) -> Inventory {
     let mut inventory = empty(&modalities);
     inventory.clips = 1;
     for (modality, row) in modalities.iter().zip(&mut inventory.modalities) {
-        let (signal, units) = match modality.name() {
-            "rgb" => (clip.rgb.as_ref().map(levels), vec!["level".to_owned()]),
-            "depth" => (clip.depth.as_ref().map(metres), vec!["m".to_owned()]),
-            _ => match modality.extract(clip) {
-                Ok(signal) => (signal, modality.units()),
-                Err(error) => {
-                    // Without the clip's id, so that equal reasons are counted together.
-                    let reason = error
-                        .to_string()
-                        .replace(&format!("clip `{}`: ", clip.id), "");
-                    row.refused.insert(reason, 1);
-                    continue;
-                }
-            },
+        let (signal, units) = match modality.measure(clip) {
+            Ok(measured) => measured,
+            Err(error) => {
+                // Without the clip's id, so that equal reasons are counted together.
+                let reason = error
+                    .to_string()
+                    .replace(&format!("clip `{}`: ", clip.id), "");
+                row.refused.insert(reason, 1);
+                continue;
+            }
         };
         if let Some(signal) = &signal {
             let shape: Vec<String> = signal.values.shape().iter().map(usize::to_string).collect();
@@ -128,24 +123,10 @@ pub fn count(clip: &Clip, format: &ClipFormat) -> Inventory {
     inventory
 }
 
-fn levels(rgb: &crate::clip::Rgb) -> Signal {
-    Signal {
-        values: rgb.frames.mapv(f32::from).into_dyn(),
-        valid: None,
-    }
-}
-
-fn metres(depth: &crate::clip::Depth) -> Signal {
-    let valid = depth.metres.mapv(f32::is_finite);
-    Signal {
-        values: depth.metres.clone().insert_axis(Axis(3)).into_dyn(),
-        valid: Some(valid.into_dyn()),
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::clip::{CAMERA, DEPTH};
     use crate::world::{World, WorldSettings};
 
     #[test]
@@ -156,9 +137,9 @@ mod tests {
         };
         let world = World::new(settings.clone(), 2);
         let mut clips: Vec<Clip> = (0..5).map(|i| world.clip(i)).collect();
-        clips[1].gaze = None;
-        clips[2].depth.as_mut().unwrap().metres.fill(f32::NAN);
-        clips[3].camera.as_mut().unwrap().valid.fill(false);
+        clips[1].remove("gaze");
+        clips[2].get_mut(DEPTH).unwrap().metres.fill(f32::NAN);
+        clips[3].get_mut(CAMERA).unwrap().valid.fill(false);
         let (mut whole, mut parts) = (
             Counter::new(&settings.format()),
             Counter::new(&settings.format()),

@@ -1,76 +1,73 @@
 //! Body and hands as 60 x 21 x 3 joints.
 
 use super::{ClipFormat, Modality, ModalityError, Shape, expect_shape};
-use crate::clip::{Clip, JointTrack, Signal};
+use crate::clip::{BODY, Clip, JointTrack, Key, LEFT_HAND, RIGHT_HAND, Signal};
 use crate::geometry::skeleton::{self, JOINTS, Skeleton};
 use ndarray::{Array2, Array3, Ix2, Ix3};
-
-/// Which joints of the clip.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Part {
-    LeftHand,
-    RightHand,
-    Body,
-}
 
 /// Joints of the body or of one hand.
 #[derive(Debug, Clone)]
 pub struct Joints {
-    part: Part,
+    key: Key<'static, JointTrack>,
+    about: &'static str,
+    frame: &'static str,
+    skeleton: &'static Skeleton,
     samples: usize,
     rate: f64,
 }
 
+/// The frame of both hands.
+const CAMERA: &str = "camera of the same sample (x right, y down, z forward)";
+
 impl Joints {
-    fn new(part: Part, format: &ClipFormat) -> Self {
+    fn new(
+        key: Key<'static, JointTrack>,
+        about: &'static str,
+        frame: &'static str,
+        skeleton: &'static Skeleton,
+        format: &ClipFormat,
+    ) -> Self {
         Self {
-            part,
+            key,
+            about,
+            frame,
+            skeleton,
             samples: format.samples,
             rate: format.signal_rate,
         }
     }
+
     /// The left hand, in the camera of the same sample.
     pub fn left_hand(format: &ClipFormat) -> Self {
-        Self::new(Part::LeftHand, format)
+        let about = "21 joints of the left hand.";
+        Self::new(LEFT_HAND, about, CAMERA, &skeleton::HAND, format)
     }
+
     /// The right hand, in the camera of the same sample.
     pub fn right_hand(format: &ClipFormat) -> Self {
-        Self::new(Part::RightHand, format)
+        let about = "21 joints of the right hand.";
+        Self::new(RIGHT_HAND, about, CAMERA, &skeleton::HAND, format)
     }
+
     /// The body, in the gravity frame of the first camera.
     pub fn body(format: &ClipFormat) -> Self {
-        Self::new(Part::Body, format)
+        let about = "21 joints of the wearer's body.";
+        let frame = "gravity frame of the first camera (x right, y forward, z up)";
+        Self::new(BODY, about, frame, &skeleton::BODY, format)
     }
+
     /// The joint list and its tree.
     pub fn skeleton(&self) -> &'static Skeleton {
-        match self.part {
-            Part::Body => &skeleton::BODY,
-            _ => &skeleton::HAND,
-        }
-    }
-    fn track<'a>(&self, clip: &'a Clip) -> Option<&'a JointTrack> {
-        match self.part {
-            Part::LeftHand => clip.left_hand.as_ref(),
-            Part::RightHand => clip.right_hand.as_ref(),
-            Part::Body => clip.body.as_ref(),
-        }
+        self.skeleton
     }
 }
 
 impl Modality for Joints {
     fn name(&self) -> &'static str {
-        match self.part {
-            Part::LeftHand => "left_hand",
-            Part::RightHand => "right_hand",
-            Part::Body => "body",
-        }
+        self.key.name()
     }
     fn about(&self) -> &'static str {
-        match self.part {
-            Part::LeftHand => "21 joints of the left hand.",
-            Part::RightHand => "21 joints of the right hand.",
-            Part::Body => "21 joints of the wearer's body.",
-        }
+        self.about
     }
     fn rate(&self) -> f64 {
         self.rate
@@ -85,14 +82,11 @@ impl Modality for Joints {
         vec!["m".to_owned()]
     }
     fn frame(&self) -> &'static str {
-        match self.part {
-            Part::Body => "gravity frame of the first camera (x right, y forward, z up)",
-            _ => "camera of the same sample (x right, y down, z forward)",
-        }
+        self.frame
     }
 
     fn extract(&self, clip: &Clip) -> Result<Option<Signal>, ModalityError> {
-        let Some(track) = self.track(clip) else {
+        let Some(track) = clip.get(self.key) else {
             return Ok(None);
         };
         let shape = [self.samples, JOINTS, 3];
@@ -133,16 +127,13 @@ impl Modality for Joints {
             .values
             .into_dimensionality::<Ix3>()
             .expect("the shape was just compared with three numbers");
-        let track = Some(JointTrack {
-            rate: self.rate,
+        let rate = self.rate;
+        let track = JointTrack {
+            rate,
             joints,
             valid,
-        });
-        match self.part {
-            Part::LeftHand => clip.left_hand = track,
-            Part::RightHand => clip.right_hand = track,
-            Part::Body => clip.body = track,
-        }
+        };
+        clip.set(self.key, track);
         Ok(())
     }
 }
@@ -155,8 +146,8 @@ mod tests {
     fn joints_go_to_their_own_place_and_back() {
         let format = ClipFormat::default();
         let mut clip = Clip::empty("a", "test");
-        for part in [Part::LeftHand, Part::RightHand, Part::Body] {
-            let modality = Joints::new(part, &format);
+        for modality in [Joints::left_hand, Joints::right_hand, Joints::body] {
+            let modality = modality(&format);
             assert!(modality.extract(&clip).unwrap().is_none());
             let values =
                 Array3::from_shape_fn((60, 21, 3), |(t, j, k)| (t * 63 + j * 3 + k) as f32);
@@ -178,11 +169,12 @@ mod tests {
     fn a_hand_never_seen_is_absent_not_zero() {
         let modality = Joints::left_hand(&ClipFormat::default());
         let mut clip = Clip::empty("a", "test");
-        clip.left_hand = Some(JointTrack {
+        let track = JointTrack {
             rate: 30.0,
             joints: Array3::zeros((60, 21, 3)),
             valid: Array2::from_elem((60, 21), false),
-        });
+        };
+        clip.set(LEFT_HAND, track);
         assert!(modality.extract(&clip).unwrap().is_none());
     }
 }

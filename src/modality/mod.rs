@@ -16,7 +16,7 @@ pub mod video;
 pub use declared::{Declared, DeclaredSettings};
 pub use format::ClipFormat;
 
-use crate::clip::{Clip, Signal};
+use crate::clip::{CameraTrack, Clip, Depth, Form, GazeTrack, JointTrack, Rgb, Signal};
 
 /// The names of the built-in modalities.
 pub const BUILT_IN: [&str; 7] = [
@@ -29,27 +29,106 @@ pub const BUILT_IN: [&str; 7] = [
     "body",
 ];
 
+/// A modality as code: what it is at the sizes of a format, and what clips hold of it. The built-in ones stand in a list here, those
+/// of a plug-in crate come in by `inventory::submit! { LinkedModality { name: "object_pose", make, form: Form::of::<Track>() } }`;
+/// a format has them where it declares a modality of that name.
+pub struct LinkedModality {
+    /// The registry name.
+    pub name: &'static str,
+    /// At the sizes of a format; its own settings are among [`ClipFormat::declared`].
+    pub make: fn(&ClipFormat) -> Box<dyn Modality>,
+    /// The type of what clips hold under this name.
+    pub form: Form,
+}
+
+::inventory::collect!(LinkedModality);
+
+static LINKED: [LinkedModality; 7] = [
+    LinkedModality {
+        name: "rgb",
+        make: |format| Box::new(video::Rgb::new(format)),
+        form: Form::of::<Rgb>(),
+    },
+    LinkedModality {
+        name: "depth",
+        make: |format| Box::new(video::Depth::new(format)),
+        form: Form::of::<Depth>(),
+    },
+    LinkedModality {
+        name: "camera",
+        make: |format| Box::new(camera::Camera::new(format)),
+        form: Form::of::<CameraTrack>(),
+    },
+    LinkedModality {
+        name: "gaze",
+        make: |format| Box::new(gaze::Gaze::new(format)),
+        form: Form::of::<GazeTrack>(),
+    },
+    LinkedModality {
+        name: "left_hand",
+        make: |format| Box::new(joints::Joints::left_hand(format)),
+        form: Form::of::<JointTrack>(),
+    },
+    LinkedModality {
+        name: "right_hand",
+        make: |format| Box::new(joints::Joints::right_hand(format)),
+        form: Form::of::<JointTrack>(),
+    },
+    LinkedModality {
+        name: "body",
+        make: |format| Box::new(joints::Joints::body(format)),
+        form: Form::of::<JointTrack>(),
+    },
+];
+
+/// The code of a modality; `None` for one that is only declared.
+pub fn linked(name: &str) -> Option<&'static LinkedModality> {
+    let plugins = ::inventory::iter::<LinkedModality>();
+    LINKED
+        .iter()
+        .chain(plugins)
+        .find(|linked| linked.name == name)
+}
+
+/// How what a clip holds of a modality is read: as a [`Signal`] where no code says else.
+pub fn form(name: &str) -> Form {
+    linked(name).map_or(Form::of::<Signal>(), |linked| linked.form)
+}
+
 /// A built-in modality by name, at the sizes of `format`; `None` for any other name.
 pub fn built_in(name: &str, format: &ClipFormat) -> Option<Box<dyn Modality>> {
-    Some(match name {
-        "rgb" => Box::new(video::Rgb::new(format)),
-        "depth" => Box::new(video::Depth::new(format)),
-        "camera" => Box::new(camera::Camera::new(format)),
-        "gaze" => Box::new(gaze::Gaze::new(format)),
-        "left_hand" => Box::new(joints::Joints::left_hand(format)),
-        "right_hand" => Box::new(joints::Joints::right_hand(format)),
-        "body" => Box::new(joints::Joints::body(format)),
-        _ => return None,
-    })
+    let linked = LINKED.iter().find(|linked| linked.name == name)?;
+    Some((linked.make)(format))
+}
+
+/// A modality that a format declares: the code of that name, or the values as they are.
+pub fn from_declaration(settings: &DeclaredSettings, format: &ClipFormat) -> Box<dyn Modality> {
+    match linked(&settings.name) {
+        Some(linked) => (linked.make)(format),
+        None => Box::new(Declared::new(settings.clone(), format)),
+    }
+}
+
+/// Puts values that a file, a sensor or code gave for a declared modality into a clip.
+///
+/// # Errors
+/// When the modality does not take values of this shape.
+pub fn put(
+    settings: &DeclaredSettings,
+    format: &ClipFormat,
+    signal: Signal,
+    clip: &mut Clip,
+) -> Result<(), ModalityError> {
+    from_declaration(settings, format).insert(signal, clip)
 }
 
 /// Every modality of `format`: the built-in ones in the order of [`BUILT_IN`], then its declared ones.
 pub fn all(format: &ClipFormat) -> Vec<Box<dyn Modality>> {
-    let built_in = BUILT_IN.iter().filter_map(|name| built_in(name, format));
+    let built_in = LINKED.iter().map(|linked| (linked.make)(format));
     let declared = format
         .declared
         .iter()
-        .map(|settings| Box::new(Declared::new(settings.clone(), format)) as Box<dyn Modality>);
+        .map(|settings| from_declaration(settings, format));
     built_in.chain(declared).collect()
 }
 
@@ -68,10 +147,13 @@ pub enum Shape {
     },
 }
 
+/// A signal, where there is one, and its units: one per channel, or one for all.
+pub type Measured = (Option<Signal>, Vec<String>);
+
 /// A kind of signal that takes part in training and reconstruction.
 ///
 /// Built-in: `rgb depth camera gaze left_hand right_hand body`. Others are declared in YAML, with values
-/// from files or from the [`code`] of a plug-in crate.
+/// from files or from the [`code`] of a plug-in crate, and, where it is more than channels over time, a [`LinkedModality`].
 pub trait Modality: Send + Sync {
     /// The registry name.
     fn name(&self) -> &str;
@@ -90,6 +172,15 @@ pub trait Modality: Send + Sync {
     /// # Errors
     /// When the clip holds the signal in a form that cannot be represented (wrong length, degenerate first camera).
     fn extract(&self, clip: &Clip) -> Result<Option<Signal>, ModalityError>;
+
+    /// What the clip has in the units a person reads, and these units: what statistics count.
+    ///
+    /// # Errors
+    /// As [`Modality::extract`].
+    fn measure(&self, clip: &Clip) -> Result<Measured, ModalityError> {
+        Ok((self.extract(clip)?, self.units()))
+    }
+
     /// Puts a (decoded) signal into `clip`; the inverse of [`Modality::extract`] up to the frame the clip is in.
     ///
     /// # Errors

@@ -1,9 +1,9 @@
 //! Colour and depth as video in [-1, 1].
 
-use super::{ClipFormat, Modality, ModalityError, Shape, expect_shape};
+use super::{ClipFormat, Measured, Modality, ModalityError, Shape, expect_shape};
 use crate::clip::depth_video::{self, DepthCoding};
-use crate::clip::{self, Clip, Signal};
-use ndarray::{Array4, ArrayD, Ix4};
+use crate::clip::{self, Clip, DEPTH, RGB, Signal};
+use ndarray::{Array4, ArrayD, Axis, Ix4};
 
 /// Colour video.
 #[derive(Debug, Clone)]
@@ -43,7 +43,7 @@ impl Modality for Rgb {
     }
 
     fn extract(&self, clip: &Clip) -> Result<Option<Signal>, ModalityError> {
-        let Some(rgb) = &clip.rgb else {
+        let Some(rgb) = clip.rgb() else {
             return Ok(None);
         };
         expect_shape(&clip.id, "rgb", rgb.frames.shape(), &self.shape)?;
@@ -54,12 +54,22 @@ impl Modality for Rgb {
         }))
     }
 
+    /// In levels of 0 to 255.
+    fn measure(&self, clip: &Clip) -> Result<Measured, ModalityError> {
+        let levels = |rgb: &clip::Rgb| Signal {
+            values: rgb.frames.mapv(f32::from).into_dyn(),
+            valid: None,
+        };
+        Ok((clip.rgb().map(levels), vec!["level".to_owned()]))
+    }
+
     fn insert(&self, signal: Signal, clip: &mut Clip) -> Result<(), ModalityError> {
         let values = values_4(&clip.id, "rgb", signal.values, &self.shape)?;
-        clip.rgb = Some(clip::Rgb {
+        let rgb = clip::Rgb {
             rate: self.rate,
             frames: values.mapv(|v| ((v + 1.0) * 127.5).round().clamp(0.0, 255.0) as u8),
-        });
+        };
+        clip.set(RGB, rgb);
         Ok(())
     }
 }
@@ -115,7 +125,7 @@ impl Modality for Depth {
     }
 
     fn extract(&self, clip: &Clip) -> Result<Option<Signal>, ModalityError> {
-        let Some(depth) = &clip.depth else {
+        let Some(depth) = clip.depth() else {
             return Ok(None);
         };
         expect_shape(&clip.id, "depth", depth.metres.shape(), &self.shape[..3])?;
@@ -126,9 +136,21 @@ impl Modality for Depth {
         }))
     }
 
+    /// In metres.
+    fn measure(&self, clip: &Clip) -> Result<Measured, ModalityError> {
+        let metres = |depth: &clip::Depth| Signal {
+            values: depth.metres.clone().insert_axis(Axis(3)).into_dyn(),
+            valid: Some(depth.metres.mapv(f32::is_finite).into_dyn()),
+        };
+        Ok((clip.depth().map(metres), vec!["m".to_owned()]))
+    }
+
     fn insert(&self, signal: Signal, clip: &mut Clip) -> Result<(), ModalityError> {
         let values = values_4(&clip.id, "depth", signal.values, &self.shape)?;
-        clip.depth = Some(depth_video::from_model(&values, self.rate, &self.coding));
+        clip.set(
+            DEPTH,
+            depth_video::from_model(&values, self.rate, &self.coding),
+        );
         Ok(())
     }
 }
@@ -174,7 +196,7 @@ mod tests {
         let frames = Array4::from_shape_fn((2, 4, 4, 3), |(t, y, x, c)| {
             (t * 127 + y * 31 + x * 7 + c) as u8
         });
-        clip.rgb = Some(clip::Rgb { rate: 8.0, frames });
+        clip.set(RGB, clip::Rgb { rate: 8.0, frames });
         let mut back = Clip::empty("a", "test");
         let signal = rgb.extract(&clip).unwrap().unwrap();
         assert!(signal.values.iter().all(|v| (-1.0..=1.0).contains(v)));
@@ -190,22 +212,23 @@ mod tests {
             0.2 + (t * 16 + y * 4 + x) as f32 * 0.1
         });
         metres[[0, 1, 2]] = f32::NAN;
-        clip.depth = Some(clip::Depth { rate: 8.0, metres });
+        clip.set(DEPTH, clip::Depth { rate: 8.0, metres });
         let signal = depth.extract(&clip).unwrap().unwrap();
         let valid = signal.valid.clone().unwrap();
         assert!(!valid[[0, 1, 2]] && valid[[0, 0, 0]]);
         assert_eq!(signal.values[[1, 2, 3, 0]], signal.values[[1, 2, 3, 2]]);
         depth.insert(signal, &mut clip).unwrap();
-        assert_eq!(clip.depth.unwrap().metres[[0, 0, 0]], 0.2);
+        assert_eq!(clip.depth().unwrap().metres[[0, 0, 0]], 0.2);
     }
 
     #[test]
     fn another_size_is_an_error_that_names_the_clip() {
         let mut clip = Clip::empty("world/000003", "test");
-        clip.rgb = Some(clip::Rgb {
+        let rgb = clip::Rgb {
             rate: 8.0,
             frames: Array4::zeros((2, 4, 5, 3)),
-        });
+        };
+        clip.set(RGB, rgb);
         let error = Rgb::new(&format()).extract(&clip).unwrap_err().to_string();
         assert!(
             error.contains("world/000003") && error.contains('5'),

@@ -330,7 +330,7 @@ fn add_pixels(
         let clip = set
             .clip_with(index, &["rgb"])
             .map_err(|error: ShardError| damaged(&error.to_string()))?;
-        if let Some(rgb) = &clip.rgb {
+        if let Some(rgb) = clip.rgb() {
             let bytes = Npz::default()
                 .with("arr_0", &rgb.frames)
                 .to_bytes()

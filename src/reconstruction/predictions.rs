@@ -336,32 +336,44 @@ fn npz_files(directory: &Path) -> Result<Vec<PredictedClip>, PredictionsError> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::clip::{CameraTrack, GazeTrack, JointTrack, Signal};
+    use crate::clip::{BODY, CAMERA, CameraTrack, GAZE, GazeTrack, JointTrack, Key, Signal};
     use nalgebra::{Isometry3, Translation3};
     use ndarray::{Array2, Array3, ArrayD};
 
     fn clip() -> Clip {
         let mut clip = Clip::empty("world/a/000001", "world");
         let turn = nalgebra::UnitQuaternion::from_euler_angles(0.1, 0.2, 0.3);
-        clip.camera = Some(CameraTrack {
-            rate: 30.0,
-            T_world_camera: vec![Isometry3::from_parts(Translation3::new(1.0, 2.0, 3.0), turn); 4],
-            valid: vec![true, false, true, true],
-            up_world: None,
-            intrinsics: None,
-        });
-        clip.gaze = Some(GazeTrack {
-            rate: 30.0,
-            points: Array2::from_elem((4, 2), 0.25),
-            valid: Array1::from_elem(4, true),
-        });
-        clip.body = Some(JointTrack {
-            rate: 30.0,
-            joints: Array3::from_elem((4, 21, 3), 0.5),
-            valid: Array2::from_elem((4, 21), true),
-        });
-        clip.declared.insert(
-            "head_imu".to_owned(),
+        clip.set(
+            CAMERA,
+            CameraTrack {
+                rate: 30.0,
+                T_world_camera: vec![
+                    Isometry3::from_parts(Translation3::new(1.0, 2.0, 3.0), turn);
+                    4
+                ],
+                valid: vec![true, false, true, true],
+                up_world: None,
+                intrinsics: None,
+            },
+        );
+        clip.set(
+            GAZE,
+            GazeTrack {
+                rate: 30.0,
+                points: Array2::from_elem((4, 2), 0.25),
+                valid: Array1::from_elem(4, true),
+            },
+        );
+        clip.set(
+            BODY,
+            JointTrack {
+                rate: 30.0,
+                joints: Array3::from_elem((4, 21, 3), 0.5),
+                valid: Array2::from_elem((4, 21), true),
+            },
+        );
+        clip.set(
+            Key::new("head_imu"),
             Signal {
                 values: ArrayD::zeros(vec![4, 6]),
                 valid: None,
@@ -380,17 +392,18 @@ mod tests {
         writer.finish().unwrap();
         let predictions = Predictions::open(folder.path()).unwrap();
         let back = predictions.load(0).unwrap();
-        let (a, b) = (clip().camera.unwrap(), back.camera.clone().unwrap());
+        let own = clip();
+        let (a, b) = (own.camera().unwrap(), back.camera().unwrap());
         assert!(
             (a.T_world_camera[0].to_homogeneous() - b.T_world_camera[0].to_homogeneous()).amax()
                 < 1e-12
         );
         assert_eq!(a.valid, b.valid);
         assert_eq!(
-            (back.id.as_str(), &back.gaze, &back.body),
-            ("world/a/000001", &clip().gaze, &clip().body)
+            (back.id.as_str(), back.gaze(), back.body()),
+            ("world/a/000001", own.gaze(), own.body())
         );
-        assert_eq!(back.declared, clip().declared);
+        assert_eq!(back.signal("head_imu"), own.signal("head_imu"));
         assert_eq!(predictions.confidence(0).unwrap(), confidence);
     }
 
@@ -410,7 +423,7 @@ mod tests {
             predictions
                 .load(0)
                 .unwrap()
-                .camera
+                .camera()
                 .unwrap()
                 .T_world_camera
                 .len(),

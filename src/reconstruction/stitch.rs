@@ -73,7 +73,7 @@ impl Stitcher {
             ..WindowBoundary::default()
         };
         let mut first_camera = self.first;
-        if let Some(camera) = &clip.camera {
+        if let Some(camera) = clip.camera() {
             let local = &camera.T_world_camera;
             let placed = self.place_camera(window, local);
             let poses: Vec<Rigid> = local.iter().map(|pose| placed * pose).collect();
@@ -96,7 +96,7 @@ impl Stitcher {
                 interpolate(a, b, t)
             });
         }
-        if let Some(gaze) = &clip.gaze {
+        if let Some(gaze) = clip.gaze() {
             let points: Vec<[f32; 2]> = gaze
                 .points
                 .rows()
@@ -110,8 +110,8 @@ impl Stitcher {
         }
         let mut hands = Vec::new();
         for (track, held) in [
-            (&clip.left_hand, &mut self.tracks.left_hand),
-            (&clip.right_hand, &mut self.tracks.right_hand),
+            (clip.left_hand(), &mut self.tracks.left_hand),
+            (clip.right_hand(), &mut self.tracks.right_hand),
         ] {
             if let Some(track) = track {
                 let joints = joints_of(track);
@@ -120,7 +120,7 @@ impl Stitcher {
             }
         }
         seam.hands_m = mean(hands.into_iter());
-        if let Some(track) = &clip.body {
+        if let Some(track) = clip.body() {
             let to_world = gravity_to_world(&first_camera);
             let joints: Vec<Joints> = joints_of(track)
                 .iter()
@@ -259,7 +259,7 @@ fn mean(values: impl Iterator<Item = f64>) -> Option<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::clip::CameraTrack;
+    use crate::clip::{BODY, CAMERA, CameraTrack, LEFT_HAND};
     use crate::geometry::rigid::level_camera;
     use crate::reconstruction::windows::windows;
     use ndarray::{Array2, Array3};
@@ -279,24 +279,30 @@ mod tests {
         let poses: Vec<Rigid> = (start..start + 60)
             .map(|s| first.inv_mul(&walk(s)))
             .collect();
-        clip.camera = Some(CameraTrack {
-            rate: 30.0,
-            valid: vec![true; 60],
-            T_world_camera: poses,
-            up_world: None,
-            intrinsics: None,
-        });
+        clip.set(
+            CAMERA,
+            CameraTrack {
+                rate: 30.0,
+                valid: vec![true; 60],
+                T_world_camera: poses,
+                up_world: None,
+                intrinsics: None,
+            },
+        );
         // A body whose joints hang below the walking camera.
         let from_world = gravity_to_world(&first).inverse();
-        clip.body = Some(JointTrack {
-            rate: 30.0,
-            joints: Array3::from_shape_fn((60, JOINTS, 3), |(t, j, k)| {
-                let world =
-                    walk(start + t).translation.vector - Vector3::new(0.0, 0.0, 0.07 * j as f64);
-                (from_world * Point3::from(world))[k] as f32
-            }),
-            valid: Array2::from_elem((60, JOINTS), true),
-        });
+        clip.set(
+            BODY,
+            JointTrack {
+                rate: 30.0,
+                joints: Array3::from_shape_fn((60, JOINTS, 3), |(t, j, k)| {
+                    let world = walk(start + t).translation.vector
+                        - Vector3::new(0.0, 0.0, 0.07 * j as f64);
+                    (from_world * Point3::from(world))[k] as f32
+                }),
+                valid: Array2::from_elem((60, JOINTS), true),
+            },
+        );
         clip
     }
 
@@ -332,11 +338,14 @@ mod tests {
         for (k, window) in list.iter().enumerate() {
             let mut clip = Clip::empty("test", "test");
             let joints = Array3::from_elem((60, JOINTS, 3), k as f32);
-            clip.left_hand = Some(JointTrack {
-                rate: 30.0,
-                joints,
-                valid: Array2::from_elem((60, JOINTS), true),
-            });
+            clip.set(
+                LEFT_HAND,
+                JointTrack {
+                    rate: 30.0,
+                    joints,
+                    valid: Array2::from_elem((60, JOINTS), true),
+                },
+            );
             stitcher.push(window, &clip);
         }
         let (tracks, seams) = stitcher.finish();

@@ -49,20 +49,20 @@ fn strips(clip: &Clip) -> Vec<(&'static str, Vec<f64>)> {
     };
     let one = |valid: &bool| f64::from(u8::from(*valid));
     let mut strips = Vec::new();
-    if let Some(camera) = &clip.camera {
+    if let Some(camera) = clip.camera() {
         strips.push(("camera", camera.valid.iter().map(one).collect()));
     }
-    if let Some(gaze) = &clip.gaze {
+    if let Some(gaze) = clip.gaze() {
         strips.push(("gaze", gaze.valid.iter().map(one).collect()));
     }
     for (name, track) in [
-        ("left hand", &clip.left_hand),
-        ("right hand", &clip.right_hand),
-        ("body", &clip.body),
+        ("left hand", clip.left_hand()),
+        ("right hand", clip.right_hand()),
+        ("body", clip.body()),
     ] {
-        strips.extend(track.as_ref().map(|track| (name, share(track))));
+        strips.extend(track.map(|track| (name, share(track))));
     }
-    for signal in clip.declared.values() {
+    for (_, signal) in clip.signals() {
         if let Some(valid) = &signal.valid {
             strips.push(("declared", valid.iter().map(one).collect()));
         }
@@ -71,20 +71,20 @@ fn strips(clip: &Clip) -> Vec<(&'static str, Vec<f64>)> {
 }
 
 fn height(clip: &Clip) -> usize {
-    let rows = usize::from(clip.rgb.is_some()) + usize::from(clip.depth.is_some());
+    let rows = usize::from(clip.rgb().is_some()) + usize::from(clip.depth().is_some());
     LINE + rows * (TILE + GAP) + strips(clip).len() * (STRIP + 4) + 2 * MARGIN
 }
 
 fn draw(canvas: &mut Canvas, clip: &Clip, mut y: usize) {
     let mut title = clip.id.clone();
-    if clip.rgb.is_none() {
+    if clip.rgb().is_none() {
         title += "   no colour";
     }
-    if clip.gaze.is_some() {
+    if clip.gaze().is_some() {
         title += "   gaze: ring";
     }
-    let intrinsics = clip.camera.as_ref().and_then(|camera| camera.intrinsics);
-    let hands = clip.left_hand.is_some() || clip.right_hand.is_some();
+    let intrinsics = clip.camera().and_then(|camera| camera.intrinsics);
+    let hands = clip.left_hand().is_some() || clip.right_hand().is_some();
     title += match (hands, intrinsics) {
         (true, Some(_)) => "   hands: left blue, right orange",
         (true, None) => "   hands not drawn: fisheye, no pinhole intrinsics",
@@ -93,7 +93,7 @@ fn draw(canvas: &mut Canvas, clip: &Clip, mut y: usize) {
     canvas.text(MARGIN, y, &title, INK);
     y += LINE;
     let column = |k: usize| MARGIN + k * (TILE + GAP);
-    if let Some(rgb) = &clip.rgb {
+    if let Some(rgb) = clip.rgb() {
         let (count, side) = (rgb.frames.shape()[0], rgb.frames.shape()[2]);
         for (k, frame) in chosen(count).into_iter().enumerate() {
             let picture = rgb.frames.index_axis(Axis(0), frame);
@@ -111,13 +111,13 @@ fn draw(canvas: &mut Canvas, clip: &Clip, mut y: usize) {
                 inside.then(|| [at(column(k), u), at(y, v)])
             };
             if let Some(k) = &intrinsics {
-                for (track, colour) in [(&clip.left_hand, LEFT), (&clip.right_hand, RIGHT)] {
+                for (track, colour) in [(clip.left_hand(), LEFT), (clip.right_hand(), RIGHT)] {
                     if let Some(track) = track {
                         hand(canvas, track, seconds, k, colour, &place);
                     }
                 }
             }
-            if let Some(gaze) = &clip.gaze {
+            if let Some(gaze) = clip.gaze() {
                 let sample = (seconds * gaze.rate).round() as usize;
                 if gaze.valid.get(sample) == Some(&true)
                     && let Some(at) = place(
@@ -133,7 +133,7 @@ fn draw(canvas: &mut Canvas, clip: &Clip, mut y: usize) {
         }
         y += TILE + GAP;
     }
-    if let Some(depth) = &clip.depth {
+    if let Some(depth) = clip.depth() {
         let side = depth.metres.shape()[2];
         let mut values: Vec<f32> = depth
             .metres
@@ -238,30 +238,36 @@ fn hand(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::clip::{CameraTrack, Rgb};
+    use crate::clip::{CAMERA, CameraTrack, LEFT_HAND, RGB, RIGHT_HAND, Rgb};
     use ndarray::{Array2, Array3, Array4};
 
     #[test]
     fn tracks_without_samples_and_hands_with_few_joints_are_drawn() {
         let mut clip = Clip::empty("short", "test");
-        clip.rgb = Some(Rgb {
-            rate: 8.0,
-            frames: Array4::zeros((1, 8, 8, 3)),
-        });
-        clip.camera = Some(CameraTrack {
-            rate: 30.0,
-            T_world_camera: Vec::new(),
-            valid: Vec::new(),
-            up_world: None,
-            intrinsics: Some(Intrinsics {
-                fx: 4.0,
-                fy: 4.0,
-                cx: 3.5,
-                cy: 3.5,
-                width: 8,
-                height: 8,
-            }),
-        });
+        clip.set(
+            RGB,
+            Rgb {
+                rate: 8.0,
+                frames: Array4::zeros((1, 8, 8, 3)),
+            },
+        );
+        clip.set(
+            CAMERA,
+            CameraTrack {
+                rate: 30.0,
+                T_world_camera: Vec::new(),
+                valid: Vec::new(),
+                up_world: None,
+                intrinsics: Some(Intrinsics {
+                    fx: 4.0,
+                    fy: 4.0,
+                    cx: 3.5,
+                    cy: 3.5,
+                    width: 8,
+                    height: 8,
+                }),
+            },
+        );
         let hand = |joints| JointTrack {
             rate: 30.0,
             joints: Array3::from_shape_fn((1, joints, 3), |(_, j, c)| match c {
@@ -271,8 +277,8 @@ mod tests {
             valid: Array2::from_elem((1, joints), true),
         };
         let without = contact_sheet(std::slice::from_ref(&clip));
-        clip.left_hand = Some(hand(0));
-        clip.right_hand = Some(hand(5));
+        clip.set(LEFT_HAND, hand(0));
+        clip.set(RIGHT_HAND, hand(5));
         let with = contact_sheet(&[clip]);
         assert_eq!(with.size().0, without.size().0);
         assert!(with.size().1 > without.size().1);

@@ -23,7 +23,7 @@ const BONE: Colour = [150, 150, 158];
 pub fn paths(clips: &[Clip]) -> Canvas {
     let shown: Vec<&Clip> = clips
         .iter()
-        .filter(|clip| clip.camera.is_some() || clip.body.is_some())
+        .filter(|clip| clip.camera().is_some() || clip.body().is_some())
         .collect();
     let row = LINE * 2 + SIDE + MARGIN;
     let width = 3 * MARGIN + 2 * SIDE;
@@ -80,7 +80,7 @@ fn joint(track: &JointTrack, sample: usize, joint: usize) -> Option<Point3<f64>>
 type Projection = fn(&Point3<f64>) -> [f64; 2];
 
 fn draw(canvas: &mut Canvas, clip: &Clip, y: usize) {
-    let camera = clip.camera.as_ref();
+    let camera = clip.camera();
     let (path, level) = camera.map(camera_in_level_frame).unwrap_or_default();
     let positions: Vec<Point3<f64>> = path.iter().flatten().map(|(p, _)| *p).collect();
     let length: f64 = positions
@@ -94,7 +94,7 @@ fn draw(canvas: &mut Canvas, clip: &Clip, y: usize) {
     canvas.text(MARGIN, y, &title, INK);
     let y = y + LINE;
     // The body's frame is the level frame only where gravity is known; without it there is no body.
-    let body = clip.body.as_ref();
+    let body = clip.body();
     let mut everything = positions.clone();
     if let Some(body) = body {
         let samples = body.joints.shape()[0];

@@ -3,9 +3,10 @@
 use super::World;
 use crate::clip::clock::SIGNAL_RATE;
 use crate::clip::source::{ClipSource, Outcome};
+use crate::clip::{Key, Signal};
 use crate::formats::ReadError;
 use crate::modality::declared::{Missing, Normalize, SignalSettings, SignalSource};
-use crate::modality::{BUILT_IN, ClipFormat, DeclaredSettings};
+use crate::modality::{BUILT_IN, ClipFormat, DeclaredSettings, put};
 use std::ops::Range;
 
 /// Clips `first..first + count` of a world.
@@ -110,10 +111,14 @@ impl ClipSource for WorldClips {
         }
         let mut clip = self.world.clip(self.clips.start + index as u64);
         if let Some(declared) = &self.declared {
-            let sensors = std::mem::take(&mut clip.declared);
+            let format = self.format().unwrap_or_default();
+            let sensors = SENSORS.map(|name| (name, clip.take::<Signal>(Key::new(name))));
             for settings in declared {
-                if let Some(signal) = sensors.get(sensor_of(&settings.name, settings)) {
-                    clip.declared.insert(settings.name.clone(), signal.clone());
+                let sensor = sensor_of(&settings.name, settings);
+                let found = sensors.iter().find(|(name, _)| *name == sensor);
+                if let Some((_, Some(signal))) = found {
+                    put(settings, &format, signal.clone(), &mut clip)
+                        .map_err(|error| ReadError::Settings(error.to_string()))?;
                 }
             }
         }

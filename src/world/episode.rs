@@ -10,7 +10,8 @@ use super::wearer::{LEFT, RIGHT, Wearer};
 use super::{HandValidity, WorldSettings, room};
 use crate::clip::frames::{self, WorldJoints};
 use crate::clip::{
-    CameraTrack, Clip, Depth, GazeTrack, Intrinsics, JointTrack, Rgb, Signal, clock,
+    BODY, CAMERA, CameraTrack, Clip, DEPTH, Depth, GAZE, GazeTrack, Intrinsics, JointTrack, Key,
+    LEFT_HAND, RGB, RIGHT_HAND, Rgb, Signal, clock,
 };
 use crate::geometry::skeleton::JOINTS;
 use crate::random::stream;
@@ -207,15 +208,14 @@ impl Episode {
         };
         let (rgb, depth) = self.video(&moments);
         let mut clip = Clip::empty(id, "world");
-        clip.rgb = Some(rgb);
-        clip.depth = Some(depth);
-        clip.gaze = Some(self.gaze_track(&moments));
-        clip.left_hand = Some(self.hand_track(&moments, LEFT, &camera));
-        clip.right_hand = Some(self.hand_track(&moments, RIGHT, &camera));
-        clip.body = body_track(&moments, &camera);
-        clip.declared
-            .insert("head_imu".to_owned(), self.head_imu(start));
-        clip.camera = Some(camera);
+        clip.set(RGB, rgb);
+        clip.set(DEPTH, depth);
+        clip.set(GAZE, self.gaze_track(&moments));
+        clip.set(LEFT_HAND, self.hand_track(&moments, LEFT, &camera));
+        clip.set(RIGHT_HAND, self.hand_track(&moments, RIGHT, &camera));
+        clip.set(BODY, body_track(&moments, &camera));
+        clip.set(Key::new("head_imu"), self.head_imu(start));
+        clip.set(CAMERA, camera);
         clip
     }
 

@@ -36,7 +36,7 @@ fn predictions(sample: &Path, place: &Path) {
     let path = place.join(format!("{}.npz", clip.id));
     std::fs::create_dir_all(path.parent().unwrap()).unwrap();
 
-    let camera = clip.camera.unwrap();
+    let camera = clip.camera().unwrap();
     let turn = nalgebra::UnitQuaternion::from_euler_angles(0.3, -0.2, 0.9);
     let mut cam = Array2::zeros((60, 9));
     for (t, pose) in camera.T_world_camera.iter().enumerate() {
@@ -48,7 +48,7 @@ fn predictions(sample: &Path, place: &Path) {
             cam[[t, 6 + axis]] = position[axis];
         }
     }
-    let gaze = clip.gaze.unwrap();
+    let gaze = clip.gaze().unwrap();
     let gaze = Array2::from_shape_fn((60, 2), |(t, axis)| {
         if gaze.valid[t] {
             gaze.points[[t, axis]] + 0.01
@@ -56,11 +56,11 @@ fn predictions(sample: &Path, place: &Path) {
             0.5
         }
     });
-    let depth = clip.depth.unwrap();
+    let depth = clip.depth().unwrap();
     let depth = depth
         .metres
         .mapv(|d| if d.is_finite() { 0.5 * d + 0.2 } else { 1.0 });
-    let body = clip.body.unwrap();
+    let body = clip.body().unwrap();
     let body = Array3::from_shape_fn(body.joints.raw_dim(), |(t, j, axis)| {
         let off = [0.03, 0.04, 0.0][axis];
         let joint = body.joints[[t, j, axis]];

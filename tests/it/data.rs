@@ -102,7 +102,7 @@ fn an_experiment_makes_clips_of_recordings_by_split() {
     );
     let clip = validation.clip(1).unwrap();
     assert_eq!(clip.id, "mine/take_1/000001");
-    let imu = &clip.declared["head_imu"];
+    let imu = &clip.signal("head_imu").unwrap();
     assert_eq!(imu.values.shape(), [60, 6]);
     // A quarter of a second at 30 Hz is sample 7.5, rounded up.
     assert_eq!(imu.values[[0, 2]], 208.0);

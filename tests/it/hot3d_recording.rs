@@ -117,13 +117,13 @@ fn pictures_of_a_recording_vrs_meet_poses_and_hands_on_one_clock() {
     assert_eq!(source.len(), 1);
     let clip = source.clip(0).unwrap().into_clip().unwrap();
     assert_eq!(clip.id, "hot3d_aria/own/000000");
-    let rgb = clip.rgb.unwrap().frames;
+    let rgb = &clip.rgb().unwrap().frames;
     assert_eq!(rgb.dim(), (16, 32, 32, 3));
     assert!(
         rgb[[5, 3, 16, 0]] > 240 && rgb[[5, 20, 16, 0]] < 60,
         "not turned upright"
     );
-    let camera = clip.camera.unwrap();
+    let camera = clip.camera().unwrap();
     for k in [0, 15, 45] {
         assert!(camera.valid[k]);
         let position = camera.T_world_camera[k].translation.vector;
@@ -134,7 +134,7 @@ fn pictures_of_a_recording_vrs_meet_poses_and_hands_on_one_clock() {
         );
     }
     // The head goes by, so the hand goes the other way: 0.01 m per sample along stored x, which is upright -y.
-    let hand = clip.left_hand.unwrap();
+    let hand = clip.left_hand().unwrap();
     assert!(hand.valid[[0, 0]] && hand.valid[[45, 0]]);
     let moved: Vec<f32> = (0..3)
         .map(|c| hand.joints[[45, 0, c]] - hand.joints[[0, 0, c]])

@@ -2,7 +2,9 @@
 
 use nalgebra::{Isometry3, Point3, UnitQuaternion, Vector3};
 use ndarray::{Array2, Array3, Array4, Ix3};
-use reviv::clip::{CameraTrack, Clip, Depth, GazeTrack, Intrinsics, JointTrack};
+use reviv::clip::{
+    CAMERA, CameraTrack, Clip, DEPTH, Depth, GAZE, GazeTrack, Intrinsics, JointTrack, LEFT_HAND,
+};
 use reviv::formats::npz::Npz;
 use reviv::geometry::rigid::Rigid;
 use reviv::geometry::rigid::level_camera;
@@ -41,62 +43,77 @@ fn decoded(start: usize, wrong: [f64; 2]) -> Clip {
     let mut clip = Clip::empty("walk", "test");
     let first = camera(start as f64);
     let poses: Vec<Rigid> = (0..60).map(|i| camera((start + i) as f64)).collect();
-    clip.camera = Some(CameraTrack {
-        rate: 30.0,
-        T_world_camera: poses.iter().map(|p| first.inv_mul(p)).collect(),
-        valid: vec![true; 60],
-        up_world: None,
-        intrinsics: None,
-    });
-    clip.gaze = Some(GazeTrack {
-        rate: 30.0,
-        points: Array2::from_elem((60, 2), 0.5),
-        valid: ndarray::Array1::from_shape_fn(60, |t| t % 7 != 0),
-    });
+    clip.set(
+        CAMERA,
+        CameraTrack {
+            rate: 30.0,
+            T_world_camera: poses.iter().map(|p| first.inv_mul(p)).collect(),
+            valid: vec![true; 60],
+            up_world: None,
+            intrinsics: None,
+        },
+    );
+    clip.set(
+        GAZE,
+        GazeTrack {
+            rate: 30.0,
+            points: Array2::from_elem((60, 2), 0.5),
+            valid: ndarray::Array1::from_shape_fn(60, |t| t % 7 != 0),
+        },
+    );
     let from_world = gravity_to_world(&first).inverse();
     let feet = [
         BODY.joint("left_foot").unwrap(),
         BODY.joint("right_foot").unwrap(),
     ];
-    clip.body = Some(JointTrack {
-        rate: 30.0,
-        joints: Array3::from_shape_fn((60, JOINTS, 3), |(t, j, k)| {
-            let at = poses[t].translation.vector;
-            let z = if feet.contains(&j) {
-                -EYE
-            } else {
-                at.z - 0.06 * j as f64
-            };
-            let lean = Vector3::new(0.1 * (j as f64).sin(), 0.02 * j as f64, 0.0);
-            (from_world * Point3::from(Vector3::new(at.x, at.y, z) + lean))[k] as f32
-        }),
-        valid: Array2::from_elem((60, JOINTS), true),
-    });
-    clip.left_hand = Some(JointTrack {
-        rate: 30.0,
-        joints: Array3::from_shape_fn((60, JOINTS, 3), |(_, j, k)| {
-            [
-                -0.1 + 0.01 * (j % 5) as f32,
-                0.2,
-                0.4 + 0.02 * (j / 5) as f32,
-            ][k]
-        }),
-        valid: Array2::from_elem((60, JOINTS), true),
-    });
-    clip.depth = Some(Depth {
-        rate: 8.0,
-        metres: Array3::from_shape_fn((16, 32, 32), |(f, row, column)| {
-            let pose = camera(start as f64 + 3.75 * f as f64);
-            let [x, y] = ray(&LENS, [32, 32], row, column);
-            let turned = pose.rotation * Vector3::new(x, y, 1.0);
-            let floor = if turned.z < 0.0 {
-                (-EYE - pose.translation.z) / turned.z
-            } else {
-                9.0
-            };
-            ((floor.min(4.0) - wrong[1]) / wrong[0]) as f32
-        }),
-    });
+    clip.set(
+        reviv::clip::BODY,
+        JointTrack {
+            rate: 30.0,
+            joints: Array3::from_shape_fn((60, JOINTS, 3), |(t, j, k)| {
+                let at = poses[t].translation.vector;
+                let z = if feet.contains(&j) {
+                    -EYE
+                } else {
+                    at.z - 0.06 * j as f64
+                };
+                let lean = Vector3::new(0.1 * (j as f64).sin(), 0.02 * j as f64, 0.0);
+                (from_world * Point3::from(Vector3::new(at.x, at.y, z) + lean))[k] as f32
+            }),
+            valid: Array2::from_elem((60, JOINTS), true),
+        },
+    );
+    clip.set(
+        LEFT_HAND,
+        JointTrack {
+            rate: 30.0,
+            joints: Array3::from_shape_fn((60, JOINTS, 3), |(_, j, k)| {
+                [
+                    -0.1 + 0.01 * (j % 5) as f32,
+                    0.2,
+                    0.4 + 0.02 * (j / 5) as f32,
+                ][k]
+            }),
+            valid: Array2::from_elem((60, JOINTS), true),
+        },
+    );
+    clip.set(
+        DEPTH,
+        Depth {
+            rate: 8.0,
+            metres: Array3::from_shape_fn((16, 32, 32), |(f, row, column)| {
+                let pose = camera(start as f64 + 3.75 * f as f64);
+                let [x, y] = ray(&LENS, [32, 32], row, column);
+                let turned = pose.rotation * Vector3::new(x, y, 1.0);
+                let floor = if turned.z < 0.0 {
+                    (-EYE - pose.translation.z) / turned.z
+                } else {
+                    9.0
+                };
+                ((floor.min(4.0) - wrong[1]) / wrong[0]) as f32
+            }),
+        },
+    );
     clip
 }
 
@@ -160,7 +177,7 @@ fn a_walk_becomes_metric_and_every_file_is_there() {
     for (frame, truth) in
         [0, 16, 30, 42].map(|f| (f, decoded((f as f64 * 3.75) as usize, [1.0, 0.0])))
     {
-        let near = truth.depth.unwrap().metres[[0, 31, 16]];
+        let near = truth.depth().unwrap().metres[[0, 31, 16]];
         worst = worst.max((metres[[frame, 31, 16]] - near).abs() / near);
     }
     assert!(worst < 0.03, "{worst}");
@@ -204,7 +221,7 @@ fn a_walk_becomes_metric_and_every_file_is_there() {
 #[test]
 fn an_anchor_depth_makes_it_metric_and_its_absence_of_floor_does_not() {
     let directory = tempfile::tempdir().unwrap();
-    let truth = decoded(0, [1.0, 0.0]).depth.unwrap().metres;
+    let truth = decoded(0, [1.0, 0.0]).take(DEPTH).unwrap().metres;
     let anchor = Array3::from_shape_fn((16, 32, 32), |(f, y, x)| truth[[f, y, x]]);
     let anchored = ReconstructionInfo {
         anchor: Some(anchor.clone()),

@@ -3,6 +3,7 @@
 
 use crate::vrs_writer::{CONFIGURATION, DATA, VrsWriter};
 use proptest::prelude::*;
+use reviv::clip::CAMERA;
 use reviv::datasets::aria::vrs::image::{Pictures, Pixels};
 use reviv::datasets::aria::vrs::{Kind, StreamId, Vrs};
 use reviv::datasets::aria::{gaze, hand_tracking, trajectory};
@@ -313,25 +314,25 @@ fn a_neutral_folder_gives_clips_with_units_frames_and_holes_in_place() {
     assert_eq!((source.name(), source.len()), ("mine", 1));
     let clip = source.clip(0).unwrap().into_clip().unwrap();
     assert_eq!(clip.id, "mine/one/000000");
-    assert_eq!(clip.rgb.unwrap().frames.dim(), (16, 32, 32, 3));
-    let depth = clip.depth.unwrap();
+    assert_eq!(clip.rgb().unwrap().frames.dim(), (16, 32, 32, 3));
+    let depth = clip.depth().unwrap();
     assert_eq!(depth.metres[[3, 20, 20]], 2.0);
     assert!(depth.metres[[3, 0, 20]].is_nan());
-    let camera = clip.camera.unwrap();
+    let camera = clip.camera().unwrap();
     assert!(camera.valid[15] && !camera.valid[25] && camera.valid[35]);
-    let gaze = clip.gaze.unwrap();
+    let gaze = clip.gaze().unwrap();
     assert!((gaze.points[[10, 0]] - 0.5).abs() < 1e-6 && (gaze.points[[10, 1]] - 0.5).abs() < 1e-6);
     assert!(!gaze.valid[3] || gaze.points[[3, 0]] == 0.5);
-    let hand = clip.left_hand.unwrap();
+    let hand = clip.left_hand().unwrap();
     // Common order: joint 5 is the index finger's knuckle, ours number 1.
     assert!((hand.joints[[0, 1, 2]] - 0.305).abs() < 1e-6);
-    let body = clip.body.unwrap();
+    let body = clip.body().unwrap();
     // World (0, 1, 0.1 j) seen from (0, 0, 1.6), x right, y forward, z up; SMPL joint 4 is ours number 3.
     assert!(
         (body.joints[[0, 3, 1]] - 1.0).abs() < 1e-6
             && (body.joints[[0, 3, 2]] - (0.4 - 1.6)).abs() < 1e-6
     );
-    assert!(clip.right_hand.is_none());
+    assert!(clip.right_hand().is_none());
 }
 
 #[test]
@@ -463,7 +464,7 @@ fn poses_of_the_ancestors_are_missing_where_they_are_zero_and_refused_where_they
         let source = egom2p::Arrays::open(root.path(), None, None, small()).unwrap();
         source.clip(0).map(|outcome| outcome.into_clip().unwrap())
     };
-    let camera = clip(1.0).unwrap().camera.unwrap();
+    let camera = clip(1.0).unwrap().take(CAMERA).unwrap();
     assert!(camera.valid[26] && !camera.valid[30] && camera.valid[34]);
     let error = clip(1e160).unwrap_err().to_string();
     assert!(
@@ -517,16 +518,16 @@ fn the_ancestors_arrays_and_tokens_are_read() {
     assert_eq!(source.modalities(), ["rgb", "camera", "gaze", "left_hand"]);
     let clip = source.clip(0).unwrap().into_clip().unwrap();
     assert_eq!(clip.id, "holoassist/a-0");
-    let gaze = clip.gaze.unwrap();
+    let gaze = clip.gaze().unwrap();
     // The middle of 896 pixels, and the top edge of the 480-pixel crop.
     assert!((gaze.points[[0, 0]] - 0.5).abs() < 1e-6 && gaze.points[[0, 1]].abs() < 1e-6);
     assert_eq!(
         (gaze.valid[17], gaze.valid[18], gaze.valid[19]),
         (true, false, true)
     );
-    let camera = clip.camera.unwrap();
+    let camera = clip.camera().unwrap();
     assert!((camera.T_world_camera[59].translation.x - 59.0).abs() < 1e-6);
-    let hand = clip.left_hand.unwrap();
+    let hand = clip.left_hand().unwrap();
     assert!(hand.valid[[0, 4]] && !hand.valid[[0, 5]]);
 
     let tokens = root.path().join("tok.npz");
@@ -564,7 +565,7 @@ fn the_ancestors_sample_files_are_read() {
     }
     let source = egom2p::Arrays::open(root.path(), None, None, CutSettings::default()).unwrap();
     let clip = source.clip(0).unwrap().into_clip().unwrap();
-    let gaze = clip.gaze.unwrap();
+    let gaze = clip.gaze().unwrap();
     // Two rows of NaN (18 and 53); the others lie in the crop.
     assert_eq!(gaze.valid.iter().filter(|v| **v).count(), 58);
     assert!(!gaze.valid[18] && !gaze.valid[53]);

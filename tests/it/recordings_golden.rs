@@ -4,8 +4,8 @@
 
 use crate::shared;
 use nalgebra::{Isometry3, Matrix4, Rotation3, UnitQuaternion, Vector3};
-use reviv::clip::Clip;
 use reviv::clip::frames::gravity_frame;
+use reviv::clip::{Clip, GAZE, RGB};
 use reviv::datasets::recording::{CutSettings, Recording};
 use reviv::datasets::{ClipSource, Outcome, adt, hot3d, mps};
 use reviv::formats::npz::Npz;
@@ -164,8 +164,8 @@ fn the_adt_sample_makes_a_clip_without_the_frame_that_has_no_depth() {
         (clip.id.as_str(), clip.source.as_str()),
         ("adt/adt_sample/000000", "adt")
     );
-    let rgb = clip.rgb.unwrap();
-    let depth = clip.depth.unwrap();
+    let rgb = clip.rgb().unwrap();
+    let depth = clip.depth().unwrap();
     assert_eq!(rgb.frames.dim(), (16, 256, 256, 3));
     assert_eq!(depth.metres.dim(), (16, 256, 256));
     // Tick 1 lies beyond the recording: the last frame that has depth (the second) is repeated from there on.
@@ -179,14 +179,14 @@ fn the_adt_sample_makes_a_clip_without_the_frame_that_has_no_depth() {
         "{}",
         depth.metres[[0, 163, 91]]
     );
-    let camera = clip.camera.unwrap();
+    let camera = clip.camera().unwrap();
     let valid: Vec<usize> = (0..60).filter(|&k| camera.valid[k]).collect();
     assert_eq!(valid, [0, 1, 2, 3, 4, 5]);
     assert_eq!(camera.intrinsics, None);
-    let gaze = clip.gaze.unwrap();
+    let gaze = clip.gaze().unwrap();
     assert!(gaze.valid[0] && !gaze.valid[30]);
     assert!((gaze.points[[0, 0]] - 0.49252).abs() < 1e-4);
-    let body = clip.body.unwrap();
+    let body = clip.body().unwrap();
     assert!(body.valid.row(0).iter().all(|v| *v));
     assert!((body.joints[[0, 9, 2]] - -1.5065).abs() < 2e-3);
 }
@@ -201,14 +201,14 @@ fn an_undistorted_clip_has_pinhole_intrinsics_and_sees_the_same() {
         ..short()
     };
     let clip = only_clip(&adt::source(&folder, settings).unwrap());
-    let intrinsics = clip.camera.unwrap().intrinsics.unwrap();
+    let intrinsics = clip.camera().unwrap().intrinsics.unwrap();
     assert!((intrinsics.fx - 128.0).abs() < 1e-9 && intrinsics.cx == 127.5);
     // The wearer looks at the same thing: the picture around the gaze point has the same mean colour in both views.
     let fisheye = only_clip(&adt::source(&folder, short()).unwrap());
     let mean = |clip: &Clip| -> [f64; 3] {
-        let gaze = clip.gaze.as_ref().unwrap();
+        let gaze = clip.gaze().unwrap();
         let (u, v) = (gaze.points[[0, 0]] * 256.0, gaze.points[[0, 1]] * 256.0);
-        let rgb = clip.rgb.as_ref().unwrap();
+        let rgb = clip.rgb().unwrap();
         std::array::from_fn(|c| {
             let mut sum = 0.0;
             for dy in -2..=2_i32 {
@@ -221,11 +221,9 @@ fn an_undistorted_clip_has_pinhole_intrinsics_and_sees_the_same() {
             sum / 25.0
         })
     };
-    let undistorted = Clip {
-        gaze: clip.gaze,
-        rgb: clip.rgb,
-        ..fisheye.clone()
-    };
+    let mut undistorted = fisheye.clone();
+    undistorted.set(GAZE, clip.gaze().cloned());
+    undistorted.set(RGB, clip.rgb().cloned());
     for (a, b) in mean(&fisheye).into_iter().zip(mean(&undistorted)) {
         assert!((a - b).abs() < 25.0, "{a} {b}");
     }
@@ -303,9 +301,9 @@ fn hot3d_aria_poses_and_hands_are_the_references() {
     assert!((wrist(1) - 0.2718).abs() < 2e-3, "{}", wrist(1));
 
     let clip = only_clip(&hot3d::aria(&folder, short()).unwrap());
-    assert!((clip.left_hand.as_ref().unwrap().joints[[0, 0, 2]] - 0.2357).abs() < 2e-3);
-    assert!((clip.right_hand.as_ref().unwrap().joints[[0, 0, 2]] - 0.2718).abs() < 2e-3);
-    assert!(clip.rgb.is_none() && clip.gaze.unwrap().valid[0]);
+    assert!((clip.left_hand().unwrap().joints[[0, 0, 2]] - 0.2357).abs() < 2e-3);
+    assert!((clip.right_hand().unwrap().joints[[0, 0, 2]] - 0.2718).abs() < 2e-3);
+    assert!(clip.rgb().is_none() && clip.gaze().unwrap().valid[0]);
 }
 
 #[test]
@@ -316,13 +314,13 @@ fn hot3d_quest_opens_with_hands_in_view() {
     let source = hot3d::quest(&folder, short()).unwrap();
     assert_eq!(source.modalities(), ["camera", "left_hand", "right_hand"]);
     let clip = only_clip(&source);
-    let camera = clip.camera.unwrap();
+    let camera = clip.camera().unwrap();
     assert_eq!(camera.up_world.unwrap().into_inner(), Vector3::y());
     // Box 0 of the sample: the left hand in camera 1201-1 covers x 439..640, y 544..764 of the stored picture.
     let lens = &hot3d::open(&folder.join("P0002_273c2819")).unwrap().cameras[0]
         .1
         .camera;
-    let hand = clip.left_hand.unwrap();
+    let hand = clip.left_hand().unwrap();
     for joint in 0..21 {
         let p = |axis: usize| f64::from(hand.joints[[0, joint, axis]]);
         let pixel = lens.project(&Vector3::new(p(1), -p(0), p(2))).unwrap();
@@ -343,7 +341,7 @@ fn mps_gives_five_clips_with_the_reference_paths_and_gaze() {
     let lengths: Vec<f64> = (0..5)
         .map(|index| {
             let clip = source.clip(index).unwrap().into_clip().unwrap();
-            let track = clip.camera.unwrap();
+            let track = clip.camera().unwrap();
             assert!(track.valid.iter().all(|v| *v));
             track
                 .T_world_camera
@@ -363,8 +361,8 @@ fn mps_gives_five_clips_with_the_reference_paths_and_gaze() {
         .to::<f64>()
         .unwrap();
     let clip = source.clip(0).unwrap().into_clip().unwrap();
-    let track = clip.camera.unwrap();
-    let eyes = clip.gaze.unwrap();
+    let track = clip.camera().unwrap();
+    let eyes = clip.gaze().unwrap();
     for k in 0..60 {
         let expected = pose(|r, c| poses[[0, k, r, c]]);
         assert!(

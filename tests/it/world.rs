@@ -36,12 +36,12 @@ fn bones_keep_their_length_through_every_clip() {
     let world = world(16);
     for clip in (0..looked_at(40)).map(|index| world.clip(index)) {
         let tracks = [
-            (&BODY, &clip.body),
-            (&HAND, &clip.left_hand),
-            (&HAND, &clip.right_hand),
+            (&BODY, clip.body()),
+            (&HAND, clip.left_hand()),
+            (&HAND, clip.right_hand()),
         ];
         for (skeleton, track) in tracks {
-            let track = track.as_ref().unwrap();
+            let track = track.unwrap();
             assert!(track.valid.iter().all(|v| *v), "{}", clip.id);
             let first = bones(skeleton, track, 0);
             for t in 1..60 {
@@ -283,7 +283,7 @@ fn what_is_to_be_learned_varies_and_is_often_in_view() {
     let (mut with_hands, mut blinks) = (0, 0);
     for index in 0..60 {
         let clip = world.clip(index);
-        let track = clip.gaze.as_ref().unwrap();
+        let track = clip.gaze().unwrap();
         for t in 0..60 {
             if track.valid[t] {
                 gaze.push([
@@ -294,12 +294,12 @@ fn what_is_to_be_learned_varies_and_is_often_in_view() {
                 blinks += 1;
             }
         }
-        let body = clip.body.as_ref().unwrap();
+        let body = clip.body().unwrap();
         heights.push(joint(body, 0, 9).z);
         travel.push((joint(body, 59, 0) - joint(body, 0, 0)).norm());
-        let seen = |hand: &Option<JointTrack>| hand.as_ref().unwrap().valid.iter().any(|v| *v);
-        with_hands += usize::from(seen(&clip.left_hand) || seen(&clip.right_hand));
-        let imu = &clip.declared["head_imu"];
+        let seen = |hand: Option<&JointTrack>| hand.unwrap().valid.iter().any(|v| *v);
+        with_hands += usize::from(seen(clip.left_hand()) || seen(clip.right_hand()));
+        let imu = &clip.signal("head_imu").unwrap();
         assert_eq!(imu.values.shape(), [60, 6]);
         let mean_force = (0..60)
             .map(|t| {
@@ -316,7 +316,7 @@ fn what_is_to_be_learned_varies_and_is_often_in_view() {
             clip.id
         );
         assert_eq!(
-            clip.camera.as_ref().unwrap().T_world_camera.len(),
+            clip.camera().unwrap().T_world_camera.len(),
             clock::SIGNAL_SAMPLES
         );
     }

@@ -26,7 +26,7 @@ inventory::submit! {
 
 /// `[T, 3]` rad/s in the axes of the camera of the same sample. The last sample has no next one and takes the one before.
 fn derive(clip: &Clip, settings: &DeclaredSettings) -> Result<Option<Signal>, ModalityError> {
-    let Some(camera) = &clip.camera else {
+    let Some(camera) = clip.camera() else {
         return Ok(None);
     };
     let poses = &camera.T_world_camera;

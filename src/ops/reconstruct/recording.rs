@@ -2,7 +2,7 @@
 
 use super::ReconstructSettings;
 use crate::clip::store::ClipSet;
-use crate::clip::{Clip, Intrinsics, Rgb};
+use crate::clip::{Clip, Intrinsics, RGB, Rgb};
 use crate::experiment::{Code, InputArtifact, StageError};
 use crate::formats::ReadError;
 use crate::geometry::rigid::Rigid;
@@ -163,14 +163,14 @@ impl Recording {
             ));
         }
         let mut clip = clips.clip(settings.clip).map_err(StageError::other)?;
-        let rgb = clip.rgb.take().ok_or_else(|| {
+        let rgb = clip.take(RGB).ok_or_else(|| {
             input(
                 format_args!("clip `{}` has no colour video", clip.id),
                 "choose another clip",
             )
         })?;
         let mut lens_settings = settings.lens;
-        let camera = clip.camera.as_ref();
+        let camera = clip.camera();
         let known = camera.and_then(|camera| camera.intrinsics);
         let mut up_known = false;
         if let Some(camera) = camera

@@ -2,7 +2,7 @@
 
 use super::ReconstructSettings;
 use super::recording::{Recording, input};
-use crate::clip::Clip;
+use crate::clip::{Clip, RGB};
 use crate::decoding::{GenerationRequest, Reconstructor};
 use crate::engine::Compute;
 use crate::experiment::{StageContext, StageError};
@@ -134,7 +134,7 @@ pub(super) fn run(
         }
         let rgb = times.take("read the video", || stream.window(window.index))?;
         let mut clip = Clip::empty(format!("{}/{:06}", recording.title, window.index), "video");
-        clip.rgb = Some(rgb.clone());
+        clip.set(RGB, rgb.clone());
         let made = times
             .take("decode", || {
                 reconstructor.reconstruct(&[clip], &[window.index as u64], &request)

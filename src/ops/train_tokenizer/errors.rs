@@ -143,7 +143,7 @@ impl Errors {
                 }
             }
             (_, "gaze") => {
-                let intrinsics = clip.camera.as_ref().and_then(|camera| camera.intrinsics);
+                let intrinsics = clip.camera().and_then(|camera| camera.intrinsics);
                 for (truth, found) in rows {
                     sums.add("distance_percent", 100.0 * distance(truth, found));
                     if let Some(intrinsics) = &intrinsics {

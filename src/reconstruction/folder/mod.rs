@@ -174,7 +174,7 @@ impl Folder {
             let from = held.len() - window.start;
             held.extend((from..window.inside).map(at));
         }
-        if let Some(depth) = &decoded.depth {
+        if let Some(depth) = decoded.depth() {
             let done = self.depth.push(window.index, start, depth.metres.view());
             self.take_depth(&done)?;
         }
