@@ -2,9 +2,10 @@
 
 use super::columns::Column;
 use super::published::Published;
+pub use super::row_scores::IntervalSettings;
 use super::row_scores::{AlignedScores, RowScores, add_differences};
 use super::scores::{FLOOR, Scores};
-use super::statistics::{Over, RESAMPLES};
+use super::statistics::Over;
 use super::table::{Cell, Row, RowKind, Table};
 use super::verdict;
 use serde::{Deserialize, Serialize};
@@ -30,22 +31,6 @@ pub struct CompareSettings {
     pub trivial_baselines: bool,
 }
 
-/// Which intervals are printed.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct IntervalSettings {
-    /// Confidence level.
-    #[schemars(range(min = 0.5, max = 0.999))]
-    pub level: f64,
-    /// What varies. With both, the wider of the two is printed.
-    pub over: Vec<Over>,
-    /// Bootstrap draws.
-    #[schemars(range(min = 100))]
-    pub resamples: usize,
-    /// Seed of the bootstrap.
-    pub seed: u64,
-}
-
 impl Default for CompareSettings {
     fn default() -> Self {
         Self {
@@ -53,17 +38,6 @@ impl Default for CompareSettings {
             baseline: None,
             interval: IntervalSettings::default(),
             trivial_baselines: true,
-        }
-    }
-}
-
-impl Default for IntervalSettings {
-    fn default() -> Self {
-        Self {
-            level: 0.95,
-            over: vec![Over::Seeds, Over::Clips],
-            resamples: RESAMPLES,
-            seed: 0,
         }
     }
 }

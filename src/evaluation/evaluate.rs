@@ -1,16 +1,16 @@
 //! An evaluation: every clip of a suite, the trivial baselines on the same clips, and what had to be left out.
 
-use super::baselines::{Means, image_centre};
-use super::columns::{Column, declared};
-use super::motion::{KinScores, frechet_distance, kin_scores, mean_cosine};
+use super::columns::Column;
+use super::metric::{AllClips, Baseline, ClipScore, Mean, MetricSet, OverClips, Pair, set_of};
 use super::outcome::{MetricError, Outcome};
-use super::score_clip::{ClipScore, score_clip, still_camera};
 use super::scores::{ColumnScores, FLOOR, FORMAT, ScoreSet, Scores, SetScore};
 use super::suite::{Suite, UnknownMetric};
 use crate::clip::Clip;
-use ndarray::{Array1, Array2, ArrayView2, Axis};
+use ndarray::Array2;
 use rayon::prelude::*;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
+
+pub use super::metric::Embeddings;
 
 /// Any failure of whoever holds the clips.
 pub type LoadError = Box<dyn std::error::Error + Send + Sync>;
@@ -41,13 +41,6 @@ pub trait Pairs: Sync {
     }
 }
 
-/// Motion embeddings that the user brings, one row per clip: TMR's 256-d mean vectors.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Embeddings {
-    pub predicted: Array2<f64>,
-    pub truth: Array2<f64>,
-}
-
 /// Why an evaluation stops.
 #[derive(Debug, thiserror::Error)]
 pub enum EvaluationError {
@@ -66,7 +59,7 @@ pub enum EvaluationError {
 }
 
 /// Clips per step between two calls of `progress`; also the unit of parallel work, so results do not depend on threads.
-pub(super) const CHUNK: usize = 64;
+const CHUNK: usize = 64;
 
 /// Scores `system`'s predictions on a suite.
 ///
@@ -82,19 +75,19 @@ pub fn evaluate(
     embeddings: Option<&Embeddings>,
     progress: &mut dyn FnMut(usize, usize) -> bool,
 ) -> Result<Scores, EvaluationError> {
-    let columns = suite.columns()?;
+    let plan = Plan::new(suite)?;
     let ids = pairs.ids();
     let chosen = match &suite.sample {
         Some(sample) => sample.draw(ids),
         None => (0..ids.len()).collect(),
     };
-    let means = Means::of_truth(pairs, &chosen, &columns)?;
+    let means = plan.means(pairs, &chosen)?;
     let mut rows: Vec<(usize, Row)> = Vec::with_capacity(chosen.len());
     let mut left_out: BTreeMap<String, usize> = BTreeMap::new();
     for chunk in chosen.chunks(CHUNK) {
         let scored: Vec<Result<Option<Row>, EvaluationError>> = chunk
             .par_iter()
-            .map(|&index| Row::score(pairs, index, &columns, suite.depth_max, &means))
+            .map(|&index| plan.score(pairs, index, &means))
             .collect();
         for (&index, row) in chunk.iter().zip(scored) {
             match row? {
@@ -112,238 +105,258 @@ pub fn evaluate(
             example: ids.first().cloned().unwrap_or_default(),
         });
     }
-
-    let mut notes = Vec::new();
-    let mut note = |count: usize, text: &str| {
-        if count > 0 {
-            notes.push(format!("{count} of {} clips: {text}", rows.len()));
-        }
-    };
-    note(
-        rows.iter().filter(|(_, r)| r.own.resampled).count(),
-        "the estimated camera was resampled to the reference's rate (linear positions, slerp rotations)",
-    );
-    note(
-        rows.iter()
-            .filter(|(_, r)| r.own.negative_depth_scale)
-            .count(),
-        "warning: the depth fit has a negative scale (the prediction looks like inverse depth)",
-    );
-    for (_, row) in &rows {
-        for modality in &row.own.missing {
-            *left_out
-                .entry(format!("no {modality} in the prediction"))
-                .or_default() += 1;
-        }
-    }
-
-    let clip_ids = rows.iter().map(|(index, _)| ids[*index].clone()).collect();
+    let clips = rows.iter().map(|(index, _)| ids[*index].clone()).collect();
     let rows: Vec<Row> = rows.into_iter().map(|(_, row)| row).collect();
-    let mut own = collect(&columns, rows.iter().map(|r| Some(&r.own)));
-    own.sets.extend(embedding_scores(&columns, embeddings)?);
+    for modality in rows.iter().flat_map(|row| &row.missing) {
+        let reason = format!("no {modality} in the prediction");
+        *left_out.entry(reason).or_default() += 1;
+    }
+    let own: Vec<Option<&Scored>> = rows.iter().map(|row| Some(&row.own)).collect();
+    let names: BTreeSet<&str> = rows
+        .iter()
+        .flat_map(|r| r.baselines.keys().copied())
+        .collect();
     let mut baselines = BTreeMap::new();
-    for (name, of) in BASELINES {
-        let set = collect(&columns, rows.iter().map(|row| of(row)));
-        let set = without_empty(set);
+    for name in names {
+        let of = rows.iter().map(|row| row.baselines.get(name));
+        let set = without_empty(plan.collect(&of.collect::<Vec<_>>(), None)?);
         if !set.columns.is_empty() || !set.sets.is_empty() {
-            baselines.insert((*name).to_owned(), set);
+            baselines.insert(name.to_owned(), set);
         }
     }
     Ok(Scores {
         format: FORMAT,
         suite: suite_name.to_owned(),
         system: system.to_owned(),
-        clips: clip_ids,
-        own,
+        clips,
+        own: plan.collect(&own, embeddings)?,
         baselines,
         left_out,
-        notes,
+        notes: notes(&own),
         sample: suite.sample.clone(),
     })
 }
 
-/// A clip's scores of the system and of every baseline.
-struct Row {
-    own: ClipScore,
-    still: ClipScore,
-    centre: ClipScore,
-    mean: ClipScore,
-    mean_depth: ClipScore,
-    mean_value: ClipScore,
-    floor: Option<ClipScore>,
+/// What a reader must know of how the system was scored, with the number of clips it holds for.
+fn notes(own: &[Option<&Scored>]) -> Vec<String> {
+    let mut counts: BTreeMap<&str, usize> = BTreeMap::new();
+    let scores = own.iter().flatten().flat_map(|scored| scored.iter());
+    for note in scores.flat_map(|score| &score.notes) {
+        *counts.entry(*note).or_default() += 1;
+    }
+    let of = own.len();
+    let note = |(text, count)| format!("{count} of {of} clips: {text}");
+    counts.into_iter().map(note).collect()
 }
 
-type BaselineOf = fn(&Row) -> Option<&ClipScore>;
+/// What a suite computes: its columns by the set that fills them, and the baselines of these sets.
+struct Plan {
+    groups: Vec<Group>,
+    /// By name: those of several modalities that share a name make one prediction.
+    baselines: Vec<Box<dyn Baseline>>,
+    columns: Vec<Column>,
+    depth_max: Option<f64>,
+}
 
-/// What asks for no learning at all, by name.
-const BASELINES: &[(&str, BaselineOf)] = &[
-    ("still camera", |row| Some(&row.still)),
-    ("image centre", |row| Some(&row.centre)),
-    ("mean pose", |row| Some(&row.mean)),
-    ("mean depth image", |row| Some(&row.mean_depth)),
-    ("mean value", |row| Some(&row.mean_value)),
-    (FLOOR, |row| row.floor.as_ref()),
-];
+/// The columns of one set.
+struct Group {
+    set: &'static dyn MetricSet,
+    columns: Vec<Column>,
+}
 
-impl Row {
+/// Of one clip and one method: a score per group.
+type Scored = Vec<ClipScore>;
+
+/// Of one clip: the scores of the system and of every baseline, and what the prediction lacks.
+struct Row {
+    own: Scored,
+    baselines: BTreeMap<&'static str, Scored>,
+    missing: BTreeSet<String>,
+}
+
+impl Plan {
+    fn new(suite: &Suite) -> Result<Self, UnknownMetric> {
+        let columns = suite.columns()?;
+        let mut groups: Vec<Group> = Vec::new();
+        for column in &columns {
+            // The suite has no column that no set fills.
+            let Some(set) = set_of(&column.name) else {
+                continue;
+            };
+            match groups
+                .iter_mut()
+                .find(|group| group.set.name() == set.name())
+            {
+                Some(group) => group.columns.push(column.clone()),
+                None => groups.push(Group {
+                    set,
+                    columns: vec![column.clone()],
+                }),
+            }
+        }
+        groups.sort_by_key(|group| group.set.name());
+        let mut baselines: Vec<Box<dyn Baseline>> = Vec::new();
+        for baseline in groups.iter().flat_map(|g| g.set.baselines(&g.columns)) {
+            let key = |b: &dyn Baseline| (b.name(), b.modality().to_owned());
+            if !baselines
+                .iter()
+                .any(|known| key(known.as_ref()) == key(baseline.as_ref()))
+            {
+                baselines.push(baseline);
+            }
+        }
+        Ok(Self {
+            groups,
+            baselines,
+            columns,
+            depth_max: suite.depth_max,
+        })
+    }
+
+    /// What each baseline averages, over the evaluated truth.
+    fn means(
+        &self,
+        pairs: &dyn Pairs,
+        chosen: &[usize],
+    ) -> Result<Vec<Option<Array2<f64>>>, EvaluationError> {
+        let mut all = vec![Mean::default(); self.baselines.len()];
+        for chunk in chosen.chunks(CHUNK) {
+            let parts: Vec<Result<Vec<Mean>, EvaluationError>> = chunk
+                .par_iter()
+                .map(|&index| {
+                    let clip = pairs.truth(index).map_err(|error| EvaluationError::Load {
+                        clip: pairs.ids()[index].clone(),
+                        error,
+                    })?;
+                    let part = |baseline: &Box<dyn Baseline>| {
+                        let mut mean = Mean::default();
+                        baseline
+                            .samples(&clip)
+                            .iter()
+                            .for_each(|some| mean.add(some));
+                        mean
+                    };
+                    Ok(self.baselines.iter().map(part).collect())
+                })
+                .collect();
+            for part in parts {
+                for (mean, more) in all.iter_mut().zip(part?) {
+                    mean.merge(more);
+                }
+            }
+        }
+        Ok(all.iter().map(Mean::value).collect())
+    }
+
     fn score(
+        &self,
         pairs: &dyn Pairs,
         index: usize,
-        columns: &[Column],
-        depth_max: Option<f64>,
-        means: &Means,
-    ) -> Result<Option<Self>, EvaluationError> {
+        means: &[Option<Array2<f64>>],
+    ) -> Result<Option<Row>, EvaluationError> {
         let clip = || pairs.ids()[index].clone();
         let load = |error| EvaluationError::Load {
             clip: clip(),
             error,
         };
+        let refused = |refusal| EvaluationError::Refused {
+            clip: clip(),
+            refusal,
+        };
         let Some(prediction) = pairs.prediction(index).map_err(load)? else {
             return Ok(None);
         };
         let truth = pairs.truth(index).map_err(load)?;
-        let score = |columns: &[Column], prediction: &Clip| {
-            score_clip(columns, depth_max, &truth, prediction).map_err(|refusal| {
-                EvaluationError::Refused {
-                    clip: clip(),
-                    refusal,
-                }
-            })
+        let score = |prediction: &Clip| -> Result<Scored, EvaluationError> {
+            let pair = Pair {
+                truth: &truth,
+                prediction,
+                depth_max: self.depth_max,
+            };
+            let groups = self.groups.iter();
+            let scores = groups.map(|group| group.set.score(&pair, &group.columns));
+            scores.collect::<Result<_, MetricError>>().map_err(refused)
         };
-        let own = score(columns, &prediction)?;
+        let own = score(&prediction)?;
+        let compared = self
+            .groups
+            .iter()
+            .flat_map(|g| g.columns.iter().map(move |c| (g.set, c)));
+        let missing = compared
+            .flat_map(|(set, column)| set.modalities(column))
+            .filter(|modality| truth.has(modality) && !prediction.has(modality))
+            .map(str::to_owned)
+            .collect();
         drop(prediction);
-        let trivial = |modalities: &[&str], trivial: &Clip| -> Result<ClipScore, EvaluationError> {
-            let mut scored = score(columns, trivial)?;
-            for (value, column) in scored.values.iter_mut().zip(columns) {
-                if !modalities.contains(&column.modality()) {
-                    *value = Outcome::Null;
-                }
+        let mut baselines: BTreeMap<&'static str, Scored> = BTreeMap::new();
+        let mut predicted: BTreeMap<&'static str, Clip> = BTreeMap::new();
+        for (baseline, mean) in self.baselines.iter().zip(means) {
+            let empty = || Clip::empty(truth.id.clone(), truth.source.clone());
+            let clip = predicted.entry(baseline.name()).or_insert_with(empty);
+            if let Some(value) = baseline.predict(&truth, mean.as_ref()) {
+                clip.insert(baseline.modality(), value);
             }
-            Ok(scored)
-        };
-        let still = ClipScore {
-            values: still_camera(columns, &truth).map_err(|refusal| EvaluationError::Refused {
-                clip: clip(),
-                refusal,
-            })?,
-            ..ClipScore::default()
-        };
-        let floor = match pairs.tokenizer_floor(index).map_err(load)? {
-            Some(floor) => Some(score(columns, &floor)?),
-            None => None,
-        };
-        let signals: Vec<&str> = columns.iter().filter_map(|c| declared(&c.name)).collect();
-        Ok(Some(Self {
+        }
+        for (name, clip) in predicted {
+            baselines.insert(name, score(&clip)?);
+        }
+        for (position, group) in self.groups.iter().enumerate() {
+            let known = group.set.closed_form(&truth, &group.columns);
+            if let Some((name, values)) = known.map_err(refused)? {
+                let empty = || vec![ClipScore::default(); self.groups.len()];
+                baselines.entry(name).or_insert_with(empty)[position].values = values;
+            }
+        }
+        if let Some(floor) = pairs.tokenizer_floor(index).map_err(load)? {
+            baselines.insert(FLOOR, score(&floor)?);
+        }
+        Ok(Some(Row {
             own,
-            still,
-            centre: trivial(&["gaze"], &image_centre(&truth))?,
-            mean: trivial(
-                &["body", "hands", "left_hand", "right_hand"],
-                &means.pose(&truth),
-            )?,
-            mean_depth: trivial(&["depth"], &means.depth(&truth))?,
-            mean_value: trivial(&signals, &means.declared(&truth))?,
-            floor,
+            baselines,
+            missing,
         }))
     }
-}
 
-/// Turns rows into columns; set-wide kinematic scores are computed here.
-fn collect<'a>(
-    columns: &[Column],
-    rows: impl Iterator<Item = Option<&'a ClipScore>> + Clone,
-) -> ScoreSet {
-    let mut set = ScoreSet::default();
-    let described: Vec<Option<&(Array1<f64>, Array1<f64>)>> = rows
-        .clone()
-        .map(|row| row.and_then(|r| r.descriptors.as_ref()))
-        .collect();
-    let kin = kinematics(&described);
-    for (position, column) in columns.iter().enumerate() {
-        match column.name.as_str() {
-            "body.kin_fid" => {
-                let found = kin.as_ref().ok();
-                set.sets.push(SetScore {
-                    column: column.clone(),
-                    value: found.and_then(|kin| kin.kin_fid),
-                    n: found.map_or(0, |kin| kin.n),
-                    dim: found.map_or(0, |kin| kin.dim),
-                    floor: found.and_then(|kin| kin.floor),
-                    unavailable: kin.as_ref().err().cloned(),
-                });
+    /// Turns one method's clips into columns, in the order of the suite; numbers of the whole set stand apart.
+    fn collect(
+        &self,
+        rows: &[Option<&Scored>],
+        embeddings: Option<&Embeddings>,
+    ) -> Result<ScoreSet, EvaluationError> {
+        let mut filled: BTreeMap<String, Vec<Outcome>> = BTreeMap::new();
+        let mut sets: Vec<SetScore> = Vec::new();
+        for (position, group) in self.groups.iter().enumerate() {
+            for (index, column) in group.columns.iter().enumerate() {
+                let value = |row: &Option<&Scored>| {
+                    row.map_or(Outcome::Null, |scored| scored[position].value(index))
+                };
+                filled.insert(column.name.clone(), rows.iter().map(value).collect());
             }
-            "body.kin_cos" => {
-                let mut cosines = kin
-                    .as_ref()
-                    .ok()
-                    .map(|k| k.cosines.as_slice())
-                    .unwrap_or_default()
-                    .iter();
-                let values = described
-                    .iter()
-                    .map(|d| Outcome::of(d.and_then(|_| cosines.next().copied())))
-                    .collect();
-                set.columns.push(ColumnScores {
-                    column: column.clone(),
-                    values,
-                });
+            let features = rows
+                .iter()
+                .map(|row| row.and_then(|s| s[position].features.as_ref()));
+            let clips = AllClips {
+                features: features.collect(),
+                embeddings,
+            };
+            let over = group.set.over_clips(&group.columns, &clips);
+            for (column, over) in over.map_err(EvaluationError::Embeddings)? {
+                match over {
+                    OverClips::PerClip(values) => drop(filled.insert(column.name, values)),
+                    OverClips::Set(score) => sets.push(score),
+                }
             }
-            _ if column.is_per_set() => {}
-            _ => set.columns.push(ColumnScores {
-                column: column.clone(),
-                values: rows
-                    .clone()
-                    .map(|row| row.map_or(Outcome::Null, |r| r.values[position]))
-                    .collect(),
-            }),
         }
-    }
-    set
-}
-
-/// Scores over the clips that have descriptors, or why there are none: fewer than two, or a clip without a direction (it sits
-/// at the mean).
-fn kinematics(described: &[Option<&(Array1<f64>, Array1<f64>)>]) -> Result<KinScores, String> {
-    let pairs: Vec<_> = described.iter().flatten().collect();
-    if pairs.len() < 2 {
-        return Err("needs two clips with every joint valid".to_owned());
-    }
-    let stack = |views: Vec<_>| ndarray::stack(Axis(0), &views).map_err(|error| error.to_string());
-    let predicted = stack(pairs.iter().map(|p| p.0.view()).collect())?;
-    let truth = stack(pairs.iter().map(|p| p.1.view()).collect())?;
-    kin_scores(predicted.view(), truth.view()).map_err(|refusal| refusal.to_string())
-}
-
-fn embedding_scores(
-    columns: &[Column],
-    embeddings: Option<&Embeddings>,
-) -> Result<Vec<SetScore>, EvaluationError> {
-    columns
-        .iter()
-        .filter(|column| column.name.starts_with("body.tmr_"))
-        .map(|column| {
-            let mut score = SetScore {
-                column: column.clone(),
-                value: None,
-                n: 0,
-                dim: 0,
-                floor: None,
-                unavailable: Some("unavailable: TMR weights not configured".to_owned()),
-            };
-            let Some(Embeddings { predicted, truth }) = embeddings else {
-                return Ok(score);
-            };
-            let (p, t): (ArrayView2<f64>, ArrayView2<f64>) = (predicted.view(), truth.view());
-            (score.n, score.dim, score.unavailable) = (predicted.nrows(), predicted.ncols(), None);
-            score.value = match column.name.as_str() {
-                "body.tmr_fid" => frechet_distance(p, t, true),
-                "body.tmr_fid_raw" => frechet_distance(p, t, false),
-                _ => mean_cosine(p, t),
-            }
-            .map_err(EvaluationError::Embeddings)?;
-            Ok(score)
+        let per_clip = self.columns.iter().filter(|column| !column.is_per_set());
+        let scores = per_clip.map(|column| ColumnScores {
+            column: column.clone(),
+            values: filled.remove(&column.name).unwrap_or_default(),
+        });
+        Ok(ScoreSet {
+            columns: scores.collect(),
+            sets,
         })
-        .collect()
+    }
 }
 
 /// Without the columns in which a baseline has nothing at all.
@@ -359,6 +372,7 @@ mod tests {
     use super::*;
     use crate::clip::{BODY, CAMERA, CameraTrack, DEPTH, Depth, GAZE, GazeTrack, JointTrack};
     use nalgebra::{Isometry3, Translation3, UnitQuaternion};
+    use ndarray::Array1;
     use ndarray::Array3;
     use rand::RngExt;
 

@@ -1,7 +1,8 @@
 //! Metrics, statistics and tables (Sec. 5).
 //!
 //! Read in this order: [`outcome`] (what a metric can say), the metrics [`joints`], [`trajectory`], [`gaze`], [`depth`],
-//! [`motion`], [`tokens`], [`runtime`]; then [`evaluate`] (every clip of a [`suite`] into [`scores`]), [`statistics`], and [`compare`]
+//! [`motion`], [`tokens`], [`runtime`]; then [`metric`] (what a modality brings: [`sets`] are the
+//! built-in ones), [`evaluate`] (every clip of a [`suite`] into [`scores`]), [`statistics`], and [`compare`]
 //! (many scores into one [`table`], a `side` per row, which [`render`] prints and
 //! [`intervals`] draws; `verdict` says what beats the trivial baselines). [`tum`] compares trajectory files.
 //!
@@ -11,12 +12,7 @@
     clippy::needless_pass_by_value,
     reason = "array views are passed by value, as ndarray does"
 )]
-#![allow(
-    clippy::ref_option,
-    reason = "signals of a clip are optional fields, handed on as they are"
-)]
 
-mod baselines;
 pub mod columns;
 pub mod compare;
 pub mod depth;
@@ -25,6 +21,7 @@ pub mod folders;
 pub mod gaze;
 pub mod intervals;
 pub mod joints;
+pub mod metric;
 pub mod motion;
 pub mod outcome;
 pub mod published;
@@ -32,8 +29,8 @@ pub mod render;
 mod row_scores;
 pub mod runtime;
 pub mod sample;
-mod score_clip;
 pub mod scores;
+pub mod sets;
 pub mod statistics;
 pub mod suite;
 pub mod table;

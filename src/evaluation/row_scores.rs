@@ -1,15 +1,42 @@
 //! One row's scores on the common clips: its cells, and its differences from another row.
 
 use super::columns::Column;
-use super::compare::IntervalSettings;
 use super::outcome::{Outcome, mean};
 use super::scores::{ScoreSet, Scores};
 use super::statistics::{
-    Difference, Interval, Over, Summary, bootstrap_mean, holm, paired_difference, student_interval,
-    summarise,
+    Difference, Interval, Over, RESAMPLES, Summary, bootstrap_mean, holm, paired_difference,
+    student_interval, summarise,
 };
 use super::table::{Cell, Row};
+use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
+
+/// Which intervals are printed.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, schemars::JsonSchema)]
+#[serde(deny_unknown_fields, default)]
+pub struct IntervalSettings {
+    /// Confidence level.
+    #[schemars(range(min = 0.5, max = 0.999))]
+    pub level: f64,
+    /// What varies. With both, the wider of the two is printed.
+    pub over: Vec<Over>,
+    /// Bootstrap draws.
+    #[schemars(range(min = 100))]
+    pub resamples: usize,
+    /// Seed of the bootstrap.
+    pub seed: u64,
+}
+
+impl Default for IntervalSettings {
+    fn default() -> Self {
+        Self {
+            level: 0.95,
+            over: vec![Over::Seeds, Over::Clips],
+            resamples: RESAMPLES,
+            seed: 0,
+        }
+    }
+}
 
 /// A score set seen on the common clips.
 pub(super) struct AlignedScores<'a> {

@@ -1,6 +1,7 @@
 //! A suite: which columns are computed on which clips. Registry entries `suite: adt_body`, ...
 
-use super::columns::{Column, names};
+use super::columns::Column;
+use super::metric::names;
 use super::sample::Sample;
 use serde::{Deserialize, Serialize};
 

@@ -2,7 +2,8 @@
 //! scores it. The signal travels with the clips; the rest are defaults of the stages that follow.
 
 use super::tokenizer_entry::TokenizerEntry;
-use crate::evaluation::columns::DECLARED;
+use crate::evaluation::columns::Column;
+use crate::evaluation::metric::metrics_of;
 use crate::experiment::{Code, Entry, Kind, KindEntry, Problem};
 use crate::modality::DeclaredSettings;
 use crate::modality::code;
@@ -91,9 +92,15 @@ pub(super) fn problems(entry: &Entry<ModalityEntry>, from_world: bool) -> Vec<Pr
         problems.push(Problem::new(Code::E0206, format!(".{key}"), reason));
     }
     for (i, metric) in entry.settings.metrics.iter().enumerate() {
-        if !DECLARED.contains(&metric.as_str()) {
-            let message = format!("declared modalities have no metric `{metric}`");
-            let help = format!("there is {}", quoted(&DECLARED));
+        if Column::named(&format!("{name}.{metric}")).is_none() {
+            let own = metrics_of(name);
+            let (message, known) = if own.is_empty() {
+                let message = format!("declared modalities have no metric `{metric}`");
+                (message, vec!["rmse"])
+            } else {
+                (format!("`{name}` has no metric `{metric}`"), own)
+            };
+            let help = format!("there is {}", quoted(&known));
             problems.push(Problem::new(Code::E0203, format!(".metrics.{i}"), message).help(help));
         }
     }
