@@ -8,6 +8,9 @@ use ndarray::{Array3, ArrayViewMut3};
 /// Joints of every skeleton here.
 pub const JOINTS: usize = 21;
 
+/// One pose of 21 joints, metres; NaN where unknown.
+pub type Joints = [[f32; 3]; JOINTS];
+
 /// A named joint list with its tree and its mirror image.
 #[derive(Debug, Clone, Copy)]
 pub struct Skeleton {

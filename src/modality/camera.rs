@@ -1,6 +1,6 @@
 //! The camera trajectory as 60 x 9: poses relative to the first, two rotation columns then translation.
 
-use super::{ClipFormat, Modality, ModalityError, Shape, expect_shape};
+use super::{ClipFormat, Lengths, Modality, ModalityError, Shape, expect_shape};
 use crate::clip::{CAMERA, CameraTrack, Clip, Signal};
 use crate::geometry::{rigid, rotation};
 use nalgebra::Isometry3;
@@ -62,6 +62,9 @@ impl Modality for Camera {
     fn units(&self) -> Vec<String> {
         let unit = |c| if c < 6 { "1" } else { "m" };
         (0..CHANNELS).map(|c| unit(c).to_owned()).collect()
+    }
+    fn lengths(&self) -> Lengths {
+        Lengths::Metric
     }
     fn frame(&self) -> &'static str {
         "first camera of the clip (x right, y down, z forward)"

@@ -160,6 +160,9 @@ impl Modality for Declared {
     fn units(&self) -> Vec<String> {
         self.settings.signal.units.clone()
     }
+    fn channels(&self) -> Vec<String> {
+        self.settings.signal.channels.clone()
+    }
     fn frame(&self) -> &str {
         &self.settings.signal.frame
     }

@@ -1,6 +1,6 @@
 //! Body and hands as 60 x 21 x 3 joints.
 
-use super::{ClipFormat, Modality, ModalityError, Shape, expect_shape};
+use super::{ClipFormat, Lengths, Modality, ModalityError, Shape, expect_shape};
 use crate::clip::{BODY, Clip, JointTrack, Key, LEFT_HAND, RIGHT_HAND, Signal};
 use crate::geometry::skeleton::{self, JOINTS, Skeleton};
 use ndarray::{Array2, Array3, Ix2, Ix3};
@@ -80,6 +80,9 @@ impl Modality for Joints {
     }
     fn units(&self) -> Vec<String> {
         vec!["m".to_owned()]
+    }
+    fn lengths(&self) -> Lengths {
+        Lengths::Metric
     }
     fn frame(&self) -> &'static str {
         self.frame

@@ -147,6 +147,17 @@ pub enum Shape {
     },
 }
 
+/// Whether lengths among the values may be read as metres.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Lengths {
+    /// In metres, as the training data are.
+    Metric,
+    /// Up to an unknown scale.
+    Relative,
+    /// There are none.
+    None,
+}
+
 /// A signal, where there is one, and its units: one per channel, or one for all.
 pub type Measured = (Option<Signal>, Vec<String>);
 
@@ -165,8 +176,16 @@ pub trait Modality: Send + Sync {
     fn shape(&self) -> Shape;
     /// One per channel (or one for all).
     fn units(&self) -> Vec<String>;
+    /// The names of the channels; empty where they have none.
+    fn channels(&self) -> Vec<String> {
+        Vec::new()
+    }
     /// The frame of reference of the values, in words: `camera of the same sample`, `gravity frame of the first camera`.
     fn frame(&self) -> &str;
+    /// What a predicted length of this modality is.
+    fn lengths(&self) -> Lengths {
+        Lengths::None
+    }
     /// The signal of this modality in `clip`; `None` where the clip does not have it.
     ///
     /// # Errors

@@ -1,6 +1,6 @@
 //! Colour and depth as video in [-1, 1].
 
-use super::{ClipFormat, Measured, Modality, ModalityError, Shape, expect_shape};
+use super::{ClipFormat, Lengths, Measured, Modality, ModalityError, Shape, expect_shape};
 use crate::clip::depth_video::{self, DepthCoding};
 use crate::clip::{self, Clip, DEPTH, RGB, Signal};
 use ndarray::{Array4, ArrayD, Axis, Ix4};
@@ -119,6 +119,9 @@ impl Modality for Depth {
             "the clip's own range".to_owned()
         };
         vec![format!("{kind}, -1 to 1 over {range}")]
+    }
+    fn lengths(&self) -> Lengths {
+        Lengths::Relative
     }
     fn frame(&self) -> &'static str {
         "image"

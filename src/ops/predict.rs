@@ -352,13 +352,7 @@ fn notes(
 ) -> Result<BTreeMap<String, SignalNote>, ReconstructorError> {
     let note = |name: &String| {
         let modality = reconstructor.modality(name)?;
-        let scale = match name.as_str() {
-            "camera" | "body" | "left_hand" | "right_hand" => ScaleStatus::Metric {
-                by: "learning from metric data".into(),
-            },
-            "depth" => ScaleStatus::Relative,
-            _ => ScaleStatus::None,
-        };
+        let scale = ScaleStatus::of(modality);
         let mut units = modality.units();
         units.dedup();
         let note = SignalNote {

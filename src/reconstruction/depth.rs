@@ -1,7 +1,7 @@
 //! Depth over windows: each window is fitted to the one before it where they overlap, blended, and handed on frame by frame, so
 //! that memory does not grow with the length of the video.
 
-use super::stitch::ramp;
+use super::track::ramp;
 use ndarray::{Array2, Array3, ArrayView3, Axis, s};
 use serde::{Deserialize, Serialize};
 

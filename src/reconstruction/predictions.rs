@@ -23,6 +23,7 @@ use self::arrays::{from_npz, to_npz};
 use crate::clip::Clip;
 use crate::formats::FormatError;
 use crate::formats::npz::Npz;
+use crate::modality::{Lengths, Modality};
 use ndarray::{Array1, Ix1};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
@@ -62,6 +63,20 @@ pub enum ScaleStatus {
     Relative,
     /// Not a length.
     None,
+}
+
+impl ScaleStatus {
+    /// Of the predictions of a modality.
+    #[must_use]
+    pub fn of(modality: &dyn Modality) -> Self {
+        match modality.lengths() {
+            Lengths::Metric => Self::Metric {
+                by: "learning from metric data".into(),
+            },
+            Lengths::Relative => Self::Relative,
+            Lengths::None => Self::None,
+        }
+    }
 }
 
 /// One clip of the index.

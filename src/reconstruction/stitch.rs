@@ -1,32 +1,83 @@
-//! Windows become one reconstruction: each is moved to where the overlap says it belongs, and the seam is blended.
-//!
-//! The camera is chained by the rigid motion that fits the overlap, rotations by slerp; the body follows its window's camera
-//! (it lives in the gravity frame of the window's first camera, so only heading and position change); hands stay in the camera
-//! of their sample, gaze in its image. A value that is unknown on one side of a seam is taken from the other.
+//! Windows become one reconstruction: each is moved to where the overlap says it belongs, and the boundary is blended. How, is for
+//! each modality to say ([`super::tracks`]).
 
+use super::track::{Description, Placement, Track, TrackEntry};
+use super::tracks::{CameraPath, GazePath, JointPath, SignalTrack};
 use super::windows::Window;
-use crate::clip::{Clip, JointTrack};
-use crate::geometry::rigid::{Rigid, interpolate};
-use crate::geometry::skeleton::JOINTS;
-use nalgebra::{Point3, Quaternion, UnitQuaternion, Vector3};
+use crate::clip::{CAMERA, Clip, DEPTH, RGB};
+use crate::geometry::rigid::Rigid;
+use crate::modality::{self, BUILT_IN, ClipFormat};
 use serde::{Deserialize, Serialize};
+use std::any::Any;
+use std::collections::BTreeMap;
 
-/// One pose of 21 joints, metres; NaN where unknown.
-pub type Joints = [[f32; 3]; JOINTS];
+pub use super::tracks::gravity_to_world;
+pub use crate::geometry::skeleton::Joints;
 
-/// Everything low-dimensional about the wearer over the whole video, at 30 Hz. A signal that was never predicted is empty.
-#[derive(Debug, Clone, Default, PartialEq)]
+/// Everything low-dimensional about the wearer over the whole video, by modality. A modality that was never predicted is absent.
+#[derive(Debug, Default)]
 pub struct Tracks {
-    /// `T_world_camera`; the world has z up.
-    pub camera: Vec<Rigid>,
-    /// Upright square image, `[0, 1]^2`; NaN where invalid.
-    pub gaze: Vec<[f32; 2]>,
-    /// In the camera of the same sample.
-    pub left_hand: Vec<Joints>,
-    /// In the camera of the same sample.
-    pub right_hand: Vec<Joints>,
-    /// In the world.
-    pub body: Vec<Joints>,
+    held: Vec<(String, Box<dyn Track>)>,
+}
+
+impl Tracks {
+    /// The track of a modality, if it is a `T`.
+    #[must_use]
+    pub fn get<T: Track>(&self, modality: &str) -> Option<&T> {
+        let (_, track) = self.held.iter().find(|(name, _)| name == modality)?;
+        let any: &dyn Any = &**track;
+        any.downcast_ref()
+    }
+
+    /// Every track: the built-in modalities in their order, then the others by name.
+    pub fn iter(&self) -> impl Iterator<Item = (&str, &dyn Track)> {
+        self.held
+            .iter()
+            .map(|(name, track)| (name.as_str(), &**track))
+    }
+
+    /// `T_world_camera` at 30 Hz; the world has z up. Empty where it was not predicted, as all that follow.
+    #[must_use]
+    pub fn camera(&self) -> &[Rigid] {
+        self.get(CAMERA.name())
+            .map_or(&[], |track: &CameraPath| &track.poses)
+    }
+
+    /// Upright square image, `[0, 1]^2`, at 30 Hz; NaN where invalid.
+    #[must_use]
+    pub fn gaze(&self) -> &[[f32; 2]] {
+        self.get("gaze")
+            .map_or(&[], |track: &GazePath| &track.points)
+    }
+
+    /// In the camera of the same sample, at 30 Hz.
+    #[must_use]
+    pub fn left_hand(&self) -> &[Joints] {
+        self.joints("left_hand")
+    }
+
+    /// In the camera of the same sample, at 30 Hz.
+    #[must_use]
+    pub fn right_hand(&self) -> &[Joints] {
+        self.joints("right_hand")
+    }
+
+    /// In the world, at 30 Hz.
+    #[must_use]
+    pub fn body(&self) -> &[Joints] {
+        self.joints("body")
+    }
+
+    /// A modality that brings no track of its own, at its own rate.
+    #[must_use]
+    pub fn signal(&self, modality: &str) -> Option<&SignalTrack> {
+        self.get(modality)
+    }
+
+    fn joints(&self, modality: &str) -> &[Joints] {
+        self.get(modality)
+            .map_or(&[], |track: &JointPath| &track.poses)
+    }
 }
 
 /// How well two neighbouring windows agree where they overlap, before blending.
@@ -44,15 +95,35 @@ pub struct WindowBoundary {
     pub body_m: Option<f64>,
     /// Mean distance of hand joints, metres.
     pub hands_m: Option<f64>,
+    /// Mean distances of other modalities, by the name of the quantity.
+    #[serde(flatten)]
+    pub others: BTreeMap<String, f64>,
+}
+
+impl WindowBoundary {
+    /// The distances, by what they are of.
+    pub fn metres(&self) -> impl Iterator<Item = (&str, f64)> {
+        let own = [
+            ("body", self.body_m),
+            ("camera", self.camera_m),
+            ("hands", self.hands_m),
+        ];
+        let others = self.others.iter();
+        let others = others.filter_map(|(name, v)| Some((name.strip_suffix("_m")?, *v)));
+        own.into_iter()
+            .filter_map(|(name, v)| Some((name, v?)))
+            .chain(others)
+    }
 }
 
 /// Takes windows in order and builds [`Tracks`].
-#[derive(Debug, Clone)]
+#[derive(Debug)]
 pub struct Stitcher {
     /// Pose of the first camera in the world.
     first: Rigid,
+    described: BTreeMap<String, Description>,
     tracks: Tracks,
-    seams: Vec<WindowBoundary>,
+    boundaries: Vec<WindowBoundary>,
 }
 
 impl Stitcher {
@@ -60,208 +131,116 @@ impl Stitcher {
     pub fn new(first: Rigid) -> Self {
         Self {
             first,
+            described: BTreeMap::new(),
             tracks: Tracks::default(),
-            seams: Vec::new(),
+            boundaries: Vec::new(),
+        }
+    }
+
+    /// With what the modalities of a format say of themselves: channels, units and rates of those that bring no track.
+    #[must_use]
+    pub fn with_format(mut self, format: &ClipFormat) -> Self {
+        let all = modality::all(format);
+        let described = all
+            .iter()
+            .map(|m| (m.name().to_owned(), Description::of(m.as_ref())));
+        self.described = described.collect();
+        self
+    }
+
+    /// An empty one that knows the same of the modalities.
+    #[must_use]
+    pub fn another(&self) -> Self {
+        Self {
+            described: self.described.clone(),
+            ..Self::new(self.first)
         }
     }
 
     /// Adds the decoded clip of a window. Windows must come in order.
     pub fn push(&mut self, window: &Window, clip: &Clip) {
-        let mut seam = WindowBoundary {
-            window: window.index,
-            at_seconds: window.start_seconds(),
-            ..WindowBoundary::default()
+        let mut place = Placement {
+            window,
+            T_world_first: self.first,
         };
-        let mut first_camera = self.first;
-        if let Some(camera) = clip.camera() {
-            let local = &camera.T_world_camera;
-            let placed = self.place_camera(window, local);
-            let poses: Vec<Rigid> = local.iter().map(|pose| placed * pose).collect();
-            first_camera = poses[0];
-            let shared = window
-                .overlap
-                .min(self.tracks.camera.len().saturating_sub(window.start));
-            if shared > 0 {
-                let old = &self.tracks.camera[window.start..window.start + shared];
-                let pairs = old.iter().zip(&poses);
-                seam.camera_m = mean(
-                    pairs
-                        .clone()
-                        .map(|(a, b)| (a.translation.vector - b.translation.vector).norm()),
-                );
-                seam.camera_deg =
-                    mean(pairs.map(|(a, b)| a.rotation.angle_to(&b.rotation).to_degrees()));
-            }
-            append(&mut self.tracks.camera, window, &poses, |a, b, t| {
-                interpolate(a, b, t)
-            });
-        }
-        if let Some(gaze) = clip.gaze() {
-            let points: Vec<[f32; 2]> = gaze
-                .points
-                .rows()
-                .into_iter()
-                .zip(&gaze.valid)
-                .map(|(p, &valid)| if valid { [p[0], p[1]] } else { [f32::NAN; 2] })
-                .collect();
-            append(&mut self.tracks.gaze, window, &points, |a, b, t| {
-                blend(*a, *b, t)
-            });
-        }
-        let mut hands = Vec::new();
-        for (track, held) in [
-            (clip.left_hand(), &mut self.tracks.left_hand),
-            (clip.right_hand(), &mut self.tracks.right_hand),
-        ] {
-            if let Some(track) = track {
-                let joints = joints_of(track);
-                hands.extend(seam_distance(held, window, &joints));
-                append(held, window, &joints, blend_joints);
-            }
-        }
-        seam.hands_m = mean(hands.into_iter());
-        if let Some(track) = clip.body() {
-            let to_world = gravity_to_world(&first_camera);
-            let joints: Vec<Joints> = joints_of(track)
+        let mut gaps: BTreeMap<String, Vec<f64>> = BTreeMap::new();
+        // Frames and depth are streamed to the folder, not held.
+        let pictures = [RGB.name(), DEPTH.name()];
+        let mut present: Vec<&str> = clip
+            .modalities()
+            .filter(|m| !pictures.contains(m))
+            .collect();
+        // The camera first: it says where the window is.
+        let order = |m: &str| {
+            (
+                BUILT_IN
+                    .iter()
+                    .position(|b| *b == m)
+                    .unwrap_or(BUILT_IN.len()),
+                m.to_owned(),
+            )
+        };
+        present.sort_by_key(|m| order(m));
+        for modality in present {
+            let held = &mut self.tracks.held;
+            let at = held
                 .iter()
-                .map(|pose| {
-                    pose.map(|p| {
-                        let moved = to_world * Point3::from(p.map(f64::from));
-                        [moved.x as f32, moved.y as f32, moved.z as f32]
-                    })
-                })
-                .collect();
-            seam.body_m = seam_distance(&self.tracks.body, window, &joints);
-            append(&mut self.tracks.body, window, &joints, blend_joints);
+                .position(|(name, _)| name == modality)
+                .unwrap_or_else(|| {
+                    let at = held.partition_point(|(name, _)| order(name) < order(modality));
+                    held.insert(at, (modality.to_owned(), track(modality, &self.described)));
+                    at
+                });
+            for gap in held[at].1.push(clip, &mut place) {
+                gaps.entry(gap.name).or_default().extend(gap.distances);
+            }
         }
         if window.overlap > 0 {
-            self.seams.push(seam);
+            let mut means: BTreeMap<String, f64> = gaps
+                .into_iter()
+                .filter_map(|(name, d)| Some((name, mean(&d)?)))
+                .collect();
+            self.boundaries.push(WindowBoundary {
+                window: window.index,
+                at_seconds: window.start_seconds(),
+                camera_m: means.remove("camera_m"),
+                camera_deg: means.remove("camera_deg"),
+                body_m: means.remove("body_m"),
+                hands_m: means.remove("hands_m"),
+                others: means,
+            });
         }
     }
 
-    /// What has been built, and how the seams were.
+    /// What has been built, and how the windows agreed.
     pub fn finish(self) -> (Tracks, Vec<WindowBoundary>) {
-        (self.tracks, self.seams)
-    }
-
-    /// The motion that takes the window's own camera world to ours: the mean over the overlap.
-    fn place_camera(&self, window: &Window, local: &[Rigid]) -> Rigid {
-        let held = &self.tracks.camera;
-        let shared = window
-            .overlap
-            .min(held.len().saturating_sub(window.start))
-            .min(local.len());
-        if shared == 0 {
-            return self.first * local[0].inverse();
-        }
-        let old = &held[window.start..window.start + shared];
-        let mut sum = Quaternion::new(0.0, 0.0, 0.0, 0.0);
-        for (a, b) in old.iter().zip(local) {
-            let q = (a.rotation * b.rotation.inverse()).into_inner();
-            // q and -q are the same rotation.
-            sum += if q.coords.dot(&sum.coords) < 0.0 {
-                -q
-            } else {
-                q
-            };
-        }
-        let rotation = UnitQuaternion::try_new(sum, 1e-9)
-            .unwrap_or_else(|| old[0].rotation * local[0].rotation.inverse());
-        let offset = old
-            .iter()
-            .zip(local)
-            .map(|(a, b)| a.translation.vector - rotation * b.translation.vector)
-            .sum::<Vector3<f64>>()
-            / shared as f64;
-        Rigid::from_parts(offset.into(), rotation)
+        (self.tracks, self.boundaries)
     }
 }
 
-/// The gravity frame of a camera (origin at its centre, x along the horizontal part of its right axis, z up) in the world.
-pub fn gravity_to_world(T_world_camera: &Rigid) -> Rigid {
-    let right = T_world_camera.rotation * Vector3::x();
-    let yaw = right.y.atan2(right.x);
-    Rigid::from_parts(
-        T_world_camera.translation,
-        UnitQuaternion::from_axis_angle(&Vector3::z_axis(), yaw),
-    )
-}
-
-/// Share of the new window at sample `i` of an overlap: rises from just above 0 to just below 1.
-pub(super) fn ramp(i: usize, overlap: usize) -> f64 {
-    (i + 1) as f64 / (overlap + 1) as f64
-}
-
-fn append<T: Clone>(held: &mut Vec<T>, window: &Window, new: &[T], mix: impl Fn(&T, &T, f64) -> T) {
-    for (i, value) in new.iter().take(window.inside).enumerate() {
-        let at = window.start + i;
-        if at < held.len() {
-            held[at] = mix(&held[at], value, ramp(i, window.overlap));
-        } else {
-            held.push(value.clone());
-        }
+fn track(modality: &str, described: &BTreeMap<String, Description>) -> Box<dyn Track> {
+    let mut description = described.get(modality).cloned().unwrap_or_default();
+    modality.clone_into(&mut description.modality);
+    let mut linked = inventory::iter::<TrackEntry>();
+    match linked.find(|entry| entry.modality == modality) {
+        Some(entry) => (entry.make)(&description),
+        None => Box::new(SignalTrack::new(description)),
     }
 }
 
-fn blend<const N: usize>(a: [f32; N], b: [f32; N], t: f64) -> [f32; N] {
-    match (
-        a.iter().all(|v| v.is_finite()),
-        b.iter().all(|v| v.is_finite()),
-    ) {
-        (true, true) => {
-            std::array::from_fn(|k| (f64::from(a[k]) * (1.0 - t) + f64::from(b[k]) * t) as f32)
-        }
-        (true, false) => a,
-        _ => b,
-    }
-}
-
-fn blend_joints(a: &Joints, b: &Joints, t: f64) -> Joints {
-    std::array::from_fn(|j| blend(a[j], b[j], t))
-}
-
-fn joints_of(track: &JointTrack) -> Vec<Joints> {
-    (0..track.joints.shape()[0])
-        .map(|t| {
-            std::array::from_fn(|j| {
-                std::array::from_fn(|k| {
-                    if track.valid[[t, j]] {
-                        track.joints[[t, j, k]]
-                    } else {
-                        f32::NAN
-                    }
-                })
-            })
-        })
-        .collect()
-}
-
-fn seam_distance(held: &[Joints], window: &Window, new: &[Joints]) -> Option<f64> {
-    let shared = window
-        .overlap
-        .min(held.len().saturating_sub(window.start))
-        .min(new.len());
-    let old = &held[held.len().min(window.start)..][..shared];
-    mean(old.iter().zip(new).flat_map(|(a, b)| {
-        (0..JOINTS).filter_map(move |j| {
-            let d = Vector3::from(a[j]) - Vector3::from(b[j]);
-            let d = f64::from(d.norm());
-            d.is_finite().then_some(d)
-        })
-    }))
-}
-
-fn mean(values: impl Iterator<Item = f64>) -> Option<f64> {
-    let (sum, n) = values.fold((0.0, 0_usize), |(sum, n), v| (sum + v, n + 1));
-    (n > 0).then(|| sum / n as f64)
+fn mean(values: &[f64]) -> Option<f64> {
+    (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::clip::{BODY, CAMERA, CameraTrack, LEFT_HAND};
+    use crate::clip::{BODY, CameraTrack, JointTrack, LEFT_HAND};
     use crate::geometry::rigid::level_camera;
+    use crate::geometry::skeleton::JOINTS;
+    use crate::reconstruction::tracks::blend_joints;
     use crate::reconstruction::windows::windows;
+    use nalgebra::{Point3, UnitQuaternion, Vector3};
     use ndarray::{Array2, Array3};
 
     /// A walk that turns and climbs, as poses in a z-up world.
@@ -314,14 +293,14 @@ mod tests {
             stitcher.push(window, &clip_at(window.start));
         }
         let (tracks, seams) = stitcher.finish();
-        assert_eq!(tracks.camera.len(), 219);
-        assert_eq!(tracks.body.len(), 219);
+        assert_eq!(tracks.camera().len(), 219);
+        assert_eq!(tracks.body().len(), 219);
         assert_eq!(seams.len(), list.len() - 1);
-        for (sample, pose) in tracks.camera.iter().enumerate() {
+        for (sample, pose) in tracks.camera().iter().enumerate() {
             let truth = walk(sample);
             assert!((pose.translation.vector - truth.translation.vector).norm() < 1e-9);
             assert!(pose.rotation.angle_to(&truth.rotation) < 1e-7);
-            let head = Vector3::from(tracks.body[sample][0].map(f64::from));
+            let head = Vector3::from(tracks.body()[sample][0].map(f64::from));
             assert!((head - truth.translation.vector).norm() < 1e-5);
         }
         assert!(
@@ -349,7 +328,7 @@ mod tests {
             stitcher.push(window, &clip);
         }
         let (tracks, seams) = stitcher.finish();
-        let x: Vec<f32> = tracks.left_hand.iter().map(|p| p[0][0]).collect();
+        let x: Vec<f32> = tracks.left_hand().iter().map(|p| p[0][0]).collect();
         assert!(x.windows(2).all(|p| p[1] >= p[0] && p[1] - p[0] < 0.08));
         assert!((seams[0].hands_m.unwrap() - 3_f64.sqrt()).abs() < 1e-6);
     }

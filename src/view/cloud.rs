@@ -1,6 +1,11 @@
 //! The points of the whole recording, quantised for the page.
 
-use crate::reconstruction::export::ply::Point;
+/// A point in the world, metres, and its sRGB colour.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Point {
+    pub position: [f32; 3],
+    pub color: [u8; 3],
+}
 
 /// 6 bytes of position, 3 of colour and 1 of padding a point.
 #[derive(Debug, Clone, PartialEq)]

@@ -4,6 +4,7 @@
 use super::canvas::{Canvas, Colour, LETTER, LINE, viridis};
 use crate::clip::{Clip, Intrinsics, JointTrack};
 use crate::geometry::skeleton::HAND;
+use crate::modality::BUILT_IN;
 use crate::video::image::Image;
 use ndarray::{Array1, Axis};
 
@@ -41,33 +42,23 @@ pub fn contact_sheet(clips: &[Clip]) -> Canvas {
     canvas
 }
 
-fn strips(clip: &Clip) -> Vec<(&'static str, Vec<f64>)> {
-    let share = |track: &JointTrack| {
-        let rows = track.valid.axis_iter(Axis(0));
-        rows.map(|row| row.iter().filter(|v| **v).count() as f64 / row.len().max(1) as f64)
-            .collect()
+/// Of every modality that says which of its values are valid, the share of valid ones per sample.
+fn strips(clip: &Clip) -> Vec<(String, Vec<f64>)> {
+    let mut names: Vec<&str> = clip.modalities().collect();
+    names.sort_by_key(|name| {
+        BUILT_IN
+            .iter()
+            .position(|known| known == name)
+            .unwrap_or(BUILT_IN.len())
+    });
+    let strip = |name: &str| {
+        let valid = clip.held(name)?.to_arrays().valid?.to::<bool>().ok()?;
+        let rows = valid.axis_iter(Axis(0));
+        let share =
+            rows.map(|row| row.iter().filter(|v| **v).count() as f64 / row.len().max(1) as f64);
+        Some((name.replace('_', " "), share.collect()))
     };
-    let one = |valid: &bool| f64::from(u8::from(*valid));
-    let mut strips = Vec::new();
-    if let Some(camera) = clip.camera() {
-        strips.push(("camera", camera.valid.iter().map(one).collect()));
-    }
-    if let Some(gaze) = clip.gaze() {
-        strips.push(("gaze", gaze.valid.iter().map(one).collect()));
-    }
-    for (name, track) in [
-        ("left hand", clip.left_hand()),
-        ("right hand", clip.right_hand()),
-        ("body", clip.body()),
-    ] {
-        strips.extend(track.map(|track| (name, share(track))));
-    }
-    for (_, signal) in clip.signals() {
-        if let Some(valid) = &signal.valid {
-            strips.push(("declared", valid.iter().map(one).collect()));
-        }
-    }
-    strips
+    names.into_iter().filter_map(strip).collect()
 }
 
 fn height(clip: &Clip) -> usize {
@@ -169,7 +160,7 @@ fn draw(canvas: &mut Canvas, clip: &Clip, mut y: usize) {
     let left = MARGIN + 12 * LETTER;
     let width = FRAMES * TILE + (FRAMES - 1) * GAP - 12 * LETTER;
     for (name, valid) in strips(clip) {
-        canvas.text(MARGIN, y, name, FAINT);
+        canvas.text(MARGIN, y, &name, FAINT);
         let all = Array1::from(valid);
         for x in 0..width {
             // A signal of no samples has none that is valid.

@@ -14,4 +14,6 @@ pub mod paths;
 pub mod scene;
 
 pub use page::write_page;
-pub use scene::{Badge, Confidence, DepthGrids, Fact, Scene, Track, VideoFrames, ViewError};
+pub use scene::{
+    Badge, Confidence, DepthGrids, Drawing, Fact, Part, Scene, Track, VideoFrames, ViewError,
+};

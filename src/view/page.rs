@@ -1,11 +1,10 @@
 //! One HTML file from a [`Scene`].
 
 use super::cloud::quantise;
-use super::scene::{Scene, Tone, Track, ViewError};
-use crate::geometry::skeleton::{self, Skeleton};
+use super::scene::{Drawing, Part, Scene, Tone, ViewError};
 use base64::engine::general_purpose::STANDARD;
 use base64::write::EncoderWriter;
-use ndarray::{Array2, Array3};
+use ndarray::Array3;
 use serde_json::{Value, json};
 use std::io::Write;
 
@@ -38,14 +37,13 @@ pub fn write_page(scene: &Scene, out: &mut impl Write) -> Result<(), ViewError> 
         "floor": scene.floor,
         // Focal length and centre as shares of the image, whose corners are (0, 0) and (1, 1).
         "lens": [lens.fx / width, lens.fy / height, (lens.cx + 0.5) / width, (lens.cy + 0.5) / height],
-        "body_bones": bones(&skeleton::BODY, 0.035),
-        "hand_bones": bones(&skeleton::HAND, 0.008),
         "video": scene.video.as_ref().map(|v| json!({
             "rate": v.rate, "count": v.len(), "offsets": v.offsets() })),
         "depth": scene.depth.as_ref().map(|d| json!({
             "size": [d.metres.shape()[2], d.metres.shape()[1]], "unit": DEPTH_UNIT })),
         "cloud": cloud.as_ref().map(|c| json!({"low": c.low, "span": c.span})),
-        "tracks": scene.tracks.iter().map(|t| json!({"name": t.name, "truth": t.truth})).collect::<Vec<Value>>(),
+        "tracks": scene.tracks.iter().map(|t| json!({"name": t.name, "truth": t.truth,
+            "parts": t.parts.iter().map(part).collect::<Vec<Value>>()})).collect::<Vec<Value>>(),
         "confidence": scene.confidence.iter().map(|c| json!({"name": c.name})).collect::<Vec<Value>>(),
     });
 
@@ -75,8 +73,13 @@ pub fn write_page(scene: &Scene, out: &mut impl Write) -> Result<(), ViewError> 
                 if let Some(cloud) = &cloud {
                     blob(out, "cloud", &cloud.bytes)?;
                 }
-                for track in &scene.tracks {
-                    track_blobs(out, track)?;
+                for (track, part) in scene
+                    .tracks
+                    .iter()
+                    .flat_map(|t| t.parts.iter().map(move |p| (t, p)))
+                {
+                    let name = format!("{}-{}", track.name, part.modality);
+                    blob(out, &name, &float_bytes(part.values.iter().copied()))?;
                 }
                 for strip in &scene.confidence {
                     blob(
@@ -94,36 +97,22 @@ pub fn write_page(scene: &Scene, out: &mut impl Write) -> Result<(), ViewError> 
     Ok(())
 }
 
-fn track_blobs(out: &mut impl Write, track: &Track) -> Result<(), ViewError> {
-    let name = &track.name;
-    if let Some(camera) = &track.camera {
-        let values = camera.iter().flat_map(|pose| match pose {
-            Some(T_world_camera) => {
-                let (t, q) = (
-                    T_world_camera.translation.vector,
-                    T_world_camera.rotation.coords,
-                );
-                [t.x, t.y, t.z, q.x, q.y, q.z, q.w].map(|v| v as f32)
-            }
-            None => [f32::NAN; 7],
-        });
-        blob(out, &format!("{name}-camera"), &float_bytes(values))?;
-    }
-    let gaze = |values: &Array2<f32>| float_bytes(values.iter().copied());
-    let joints = |values: &Array3<f32>| float_bytes(values.iter().copied());
-    if let Some(values) = &track.gaze {
-        blob(out, &format!("{name}-gaze"), &gaze(values))?;
-    }
-    for (part, values) in [
-        ("body", &track.body),
-        ("left_hand", &track.left_hand),
-        ("right_hand", &track.right_hand),
-    ] {
-        if let Some(values) = values {
-            blob(out, &format!("{name}-{part}"), &joints(values))?;
+fn part(part: &Part) -> Value {
+    let mut about = match &part.drawing {
+        Drawing::Camera => json!({"kind": "camera"}),
+        Drawing::Pose => json!({"kind": "pose"}),
+        Drawing::ImagePoint => json!({"kind": "point"}),
+        Drawing::Joints { bones, in_image } => {
+            json!({"kind": "joints", "bones": bones, "in_image": in_image})
         }
-    }
-    Ok(())
+        Drawing::Plot { channels, units } => {
+            json!({"kind": "plot", "channels": channels, "units": units})
+        }
+    };
+    about["name"] = json!(part.modality);
+    about["layer"] = json!(part.layer);
+    about["width"] = json!(part.values.ncols());
+    about
 }
 
 /// `u16` steps of [`DEPTH_UNIT`], little-endian; 0 where unknown.
@@ -143,10 +132,6 @@ fn depth_bytes(metres: &Array3<f32>) -> Vec<u8> {
 
 fn float_bytes(values: impl Iterator<Item = f32>) -> Vec<u8> {
     values.flat_map(f32::to_le_bytes).collect()
-}
-
-fn bones(skeleton: &Skeleton, radius: f32) -> Vec<(usize, usize, f32)> {
-    skeleton.bones().map(|(a, b)| (a, b, radius)).collect()
 }
 
 fn blob(out: &mut impl Write, name: &str, bytes: &[u8]) -> Result<(), ViewError> {

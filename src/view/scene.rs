@@ -1,8 +1,7 @@
 //! What the page can show. All positions are metres in one world with z up.
 
+use super::cloud::Point;
 use crate::clip::Intrinsics;
-use crate::reconstruction::export::ply::Point;
-use nalgebra::Isometry3;
 use ndarray::{Array2, Array3, ArrayView3};
 
 /// Everything on one timeline.
@@ -134,16 +133,53 @@ pub struct Track {
     pub name: String,
     /// Drawn stippled and toggled apart.
     pub truth: bool,
-    /// `T_world_camera` per sample; `None` where unknown.
-    pub camera: Option<Vec<Option<Isometry3<f64>>>>,
-    /// `[samples, 2]`, image in `[0, 1]^2`; NaN where unknown.
-    pub gaze: Option<Array2<f32>>,
-    /// `[samples, 21, 3]`, world; NaN where unknown.
-    pub body: Option<Array3<f32>>,
-    /// `[samples, 21, 3]`, world; NaN where unknown.
-    pub left_hand: Option<Array3<f32>>,
-    /// `[samples, 21, 3]`, world; NaN where unknown.
-    pub right_hand: Option<Array3<f32>>,
+    /// What is known of it, each modality once.
+    pub parts: Vec<Part>,
+}
+
+/// One modality of one version of the wearer.
+#[derive(Debug, Clone)]
+pub struct Part {
+    pub modality: String,
+    /// What is shown and hidden together: `body`, `hands`, `gaze`, `camera`, or a name of its own.
+    pub layer: String,
+    pub drawing: Drawing,
+    /// One row per sample of the timeline, NaN where unknown; what a row holds, the drawing says.
+    pub values: Array2<f32>,
+}
+
+impl Part {
+    /// With these values.
+    pub fn new(modality: &str, layer: &str, drawing: Drawing, values: Array2<f32>) -> Self {
+        Self {
+            modality: modality.to_owned(),
+            layer: layer.to_owned(),
+            drawing,
+            values,
+        }
+    }
+}
+
+/// How the page draws a modality.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Drawing {
+    /// The camera: position and quaternion (x y z w) in the world, 7 numbers. A path and a frustum.
+    Camera,
+    /// Something else with a pose in the world, 7 numbers. A path and its axes.
+    Pose,
+    /// x and y in the image, `[0, 1]^2`. A ring in the image, a ray in the world.
+    ImagePoint,
+    /// Joints in the world, 3 numbers each. Bones are pairs of joints and a radius in metres.
+    Joints {
+        bones: Vec<(usize, usize, f32)>,
+        /// Drawn into the image too.
+        in_image: bool,
+    },
+    /// Channels over time, one number each. Curves beside the video.
+    Plot {
+        channels: Vec<String>,
+        units: Vec<String>,
+    },
 }
 
 /// A strip under the timeline: 1 is certain, 0 is a guess.
@@ -197,23 +233,20 @@ impl Scene {
             }
         };
         for track in &self.tracks {
-            let name = &track.name;
-            if let Some(camera) = &track.camera {
-                same(format!("{name} camera"), camera.len(), self.samples)?;
-            }
-            if let Some(gaze) = &track.gaze {
-                same(format!("{name} gaze"), gaze.nrows(), self.samples)?;
-            }
-            let joints = [
-                ("body", &track.body),
-                ("left hand", &track.left_hand),
-                ("right hand", &track.right_hand),
-            ];
-            for (part, values) in joints {
-                if let Some(values) = values {
-                    same(format!("{name} {part}"), values.shape()[0], self.samples)?;
-                    same(format!("{name} {part} joints"), values.shape()[1], 21)?;
-                }
+            for part in &track.parts {
+                let what = format!("{} {}", track.name, part.modality.replace('_', " "));
+                let (rows, columns) = part.values.dim();
+                same(what.clone(), rows, self.samples)?;
+                let expected = match &part.drawing {
+                    Drawing::Camera | Drawing::Pose => 7,
+                    Drawing::ImagePoint => 2,
+                    Drawing::Joints { bones, .. } => {
+                        let last = bones.iter().map(|(a, b, _)| a.max(b) + 1).max();
+                        3 * last.unwrap_or(columns / 3)
+                    }
+                    Drawing::Plot { .. } => columns,
+                };
+                same(format!("{what} values"), columns, expected)?;
             }
         }
         if let (Some(video), Some(depth)) = (&self.video, &self.depth) {

@@ -4,10 +4,12 @@ use nalgebra::{Isometry3, UnitQuaternion, Vector3};
 use ndarray::{Array2, Array3};
 use reviv::clip::Intrinsics;
 use reviv::geometry::rigid::level_camera;
-use reviv::geometry::skeleton::JOINTS;
+use reviv::geometry::skeleton::{BODY, HAND, JOINTS, Skeleton};
 use reviv::reconstruction::cloud::lift;
 use reviv::view::scene::Tone;
-use reviv::view::{Badge, Confidence, DepthGrids, Fact, Scene, Track, VideoFrames, write_page};
+use reviv::view::{
+    Badge, Confidence, DepthGrids, Drawing, Fact, Part, Scene, Track, VideoFrames, write_page,
+};
 use std::process::Command;
 
 /// Four seconds of a figure that walks forward through a corridor, with a truth beside the prediction.
@@ -51,30 +53,46 @@ fn scene() -> Scene {
             .index_axis_mut(ndarray::Axis(0), frame)
             .assign(&depth);
     }
-    let track = |name: &str, truth: bool, off: f32| Track {
-        name: name.into(),
-        truth,
-        camera: Some((0..samples).map(|s| Some(pose(s as f64 / 30.0))).collect()),
-        gaze: Some(Array2::from_shape_fn((samples, 2), |(s, k)| {
+    let track = |name: &str, truth: bool, off: f32| {
+        let camera = Array2::from_shape_fn((samples, 7), |(s, k)| {
+            let pose = pose(s as f64 / 30.0);
+            let (p, q) = (pose.translation.vector, pose.rotation.coords);
+            [p.x, p.y, p.z, q.x, q.y, q.z, q.w][k] as f32
+        });
+        let gaze = Array2::from_shape_fn((samples, 2), |(s, k)| {
             0.5 + off + 0.2 * (s as f32 * 0.05 + k as f32).sin()
-        })),
-        body: Some(Array3::from_shape_fn(
-            (samples, JOINTS, 3),
-            |(s, j, k)| match k {
-                0 => off + 0.2 * (j as f32 * 1.3).sin(),
-                1 => s as f32 * 0.02,
-                _ => -0.08 * j as f32,
-            },
-        )),
-        left_hand: Some(Array3::from_shape_fn(
-            (samples, JOINTS, 3),
-            |(s, j, k)| match k {
-                0 => off - 0.2 + 0.01 * j as f32,
-                1 => 0.4 + s as f32 * 0.02,
-                _ => -0.2 - 0.005 * (j * j % 11) as f32,
-            },
-        )),
-        right_hand: None,
+        });
+        let body = Array2::from_shape_fn((samples, 3 * JOINTS), |(s, i)| match i % 3 {
+            0 => off + 0.2 * ((i / 3) as f32 * 1.3).sin(),
+            1 => s as f32 * 0.02,
+            _ => -0.08 * (i / 3) as f32,
+        });
+        let hand = Array2::from_shape_fn((samples, 3 * JOINTS), |(s, i)| match i % 3 {
+            0 => off - 0.2 + 0.01 * (i / 3) as f32,
+            1 => 0.4 + s as f32 * 0.02,
+            _ => -0.2 - 0.005 * ((i / 3) * (i / 3) % 11) as f32,
+        });
+        let pulse = Array2::from_shape_fn((samples, 2), |(s, k)| (s as f32 * 0.1 + k as f32).sin());
+        let joints = |skeleton: &Skeleton, radius, in_image| Drawing::Joints {
+            bones: skeleton.bones().map(|(a, b)| (a, b, radius)).collect(),
+            in_image,
+        };
+        let plot = Drawing::Plot {
+            channels: vec!["left".into(), "</script>".into()],
+            units: vec!["1".into()],
+        };
+        Track {
+            name: name.into(),
+            truth,
+            parts: vec![
+                Part::new("camera", "camera", Drawing::Camera, camera.clone()),
+                Part::new("gaze", "gaze", Drawing::ImagePoint, gaze),
+                Part::new("left_hand", "hands", joints(&HAND, 0.008, true), hand),
+                Part::new("body", "body", joints(&BODY, 0.035, false), body),
+                Part::new("cup", "cup", Drawing::Pose, camera),
+                Part::new("contact", "contact", plot, pulse),
+            ],
+        }
     };
     Scene {
         title: "A corridor </script><b>".into(),
@@ -124,7 +142,7 @@ fn the_page_is_one_file_and_keeps_hostile_text_inside() {
 #[test]
 fn lengths_that_disagree_are_refused() {
     let mut wrong = scene();
-    wrong.tracks[0].gaze = Some(Array2::zeros((7, 2)));
+    wrong.tracks[0].parts[1].values = Array2::zeros((7, 2));
     let error = write_page(&wrong, &mut Vec::new()).unwrap_err();
     assert_eq!(
         error.to_string(),

@@ -119,8 +119,9 @@ pub(super) fn run(
         badges: recording.badges.clone(),
         truth: recording.truth.clone(),
     };
-    let mut folder =
-        Folder::new(&context.output().join(FOLDER), setting).map_err(StageError::other)?;
+    let mut folder = Folder::new(&context.output().join(FOLDER), setting)
+        .map_err(StageError::other)?
+        .with_format(&format);
     let request = GenerationRequest {
         inputs: &inputs,
         targets: &targets,

@@ -4,8 +4,7 @@
 //! best turns its rest bones into the observed ones (with a single bone, the smallest such rotation: twist is not observable
 //! from positions). The root carries the position. Lengths are centimetres and y is up, as BVH readers expect.
 
-use crate::geometry::skeleton::{JOINTS, Skeleton};
-use crate::reconstruction::stitch::Joints;
+use crate::geometry::skeleton::{JOINTS, Joints, Skeleton};
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
 use std::io::Write;
 

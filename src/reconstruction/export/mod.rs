@@ -5,6 +5,7 @@
 
 pub mod bvh;
 pub mod camera;
+pub mod files;
 pub mod manifest;
 pub mod ply;
 

@@ -2,12 +2,7 @@
 
 use std::io::Write;
 
-/// A point in the world, metres, and its sRGB colour.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Point {
-    pub position: [f32; 3],
-    pub color: [u8; 3],
-}
+pub use crate::view::cloud::Point;
 
 /// Writes `points`.
 ///

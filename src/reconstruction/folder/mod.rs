@@ -8,8 +8,10 @@ mod page;
 use self::files::write_file;
 use super::cloud::{lift, ray};
 use super::depth::{DepthSeam, DepthStitcher};
+use super::export::files::sample_of;
 use super::export::manifest::ArrayFacts;
 use super::export::ply::Point;
+pub use super::folder_error::FolderError;
 use super::frame_buffer::DepthSpool;
 use super::predictions::ScaleStatus;
 use super::scale::{
@@ -19,10 +21,10 @@ use super::stitch::{Stitcher, Tracks, WindowBoundary, gravity_to_world};
 use super::windows::Window;
 use crate::clip::clock::{SIGNAL_RATE, SIGNAL_SAMPLES};
 use crate::clip::{Clip, Intrinsics};
-use crate::formats::FormatError;
 use crate::geometry::rigid::Rigid;
 use crate::geometry::skeleton::BODY;
-use crate::view::{Badge, Fact, VideoFrames, ViewError, write_page};
+use crate::modality::ClipFormat;
+use crate::view::{Badge, Fact, VideoFrames, write_page};
 use ndarray::{Array2, Array3, ArrayView2, ArrayView3, ArrayView4, Axis};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -63,23 +65,6 @@ pub struct ReconstructionInfo {
     pub badges: Vec<Badge>,
     /// The true clip, where it is known and the video is one clip.
     pub truth: Option<Clip>,
-}
-
-/// Why a reconstruction folder cannot be written.
-#[derive(Debug, thiserror::Error)]
-pub enum FolderError {
-    #[error("{path}: {error}")]
-    Io {
-        path: PathBuf,
-        #[source]
-        error: std::io::Error,
-    },
-    #[error(transparent)]
-    Format(#[from] FormatError),
-    #[error(transparent)]
-    View(#[from] ViewError),
-    #[error("{0}")]
-    Manifest(#[from] serde_json::Error),
 }
 
 /// What `manifest.json` of the folder holds.
@@ -142,6 +127,13 @@ impl Folder {
         })
     }
 
+    /// With what the modalities of the decoded clips say of themselves: channels, units, rates.
+    #[must_use]
+    pub fn with_format(mut self, format: &ClipFormat) -> Self {
+        self.stitcher = self.stitcher.with_format(format);
+        self
+    }
+
     /// Adds a window: its frames `[T, S, S, 3]`, the decoded clip, and per modality the confidence of its samples, at any
     /// rate, over the whole window.
     ///
@@ -188,8 +180,8 @@ impl Folder {
     pub fn finish(mut self) -> Result<Manifest, FolderError> {
         let (rest, depth_seams) = std::mem::take(&mut self.depth).finish();
         self.take_depth(&rest)?;
-        let (tracks, seams) =
-            std::mem::replace(&mut self.stitcher, Stitcher::new(Rigid::identity())).finish();
+        let fresh = self.stitcher.another();
+        let (tracks, seams) = std::mem::replace(&mut self.stitcher, fresh).finish();
         let feet = foot_heights(&tracks);
         let floor = floor_height(&feet, self.setting.floor_fit.rule).ok();
         let (scale, fit, refused) = self.fit_scale(&tracks, floor);
@@ -224,7 +216,7 @@ impl Folder {
         };
         self.write_tracks(&tracks, &mut manifest)?;
         self.write_points(&cloud, &mut manifest)?;
-        let page = self.page(tracks, cloud, floor, &manifest);
+        let page = self.page(&tracks, cloud, floor, &manifest);
         let path = self.path.clone();
         write_file(&path, PAGE, &mut manifest.files, |out| {
             Ok(write_page(&page, out)?)
@@ -265,8 +257,8 @@ impl Folder {
         }
         let (by, fit) = match &self.setting.anchor {
             Some(anchor) => ("anchor depth", self.fit_to_anchor(anchor)),
-            None if tracks.camera.is_empty() => ("floor fit", Err(ScaleRefusal::NoCamera)),
-            None if tracks.body.is_empty() => ("floor fit", Err(ScaleRefusal::NoBody)),
+            None if tracks.camera().is_empty() => ("floor fit", Err(ScaleRefusal::NoCamera)),
+            None if tracks.body().is_empty() => ("floor fit", Err(ScaleRefusal::NoBody)),
             None => ("floor fit", self.fit_to_floor(tracks, floor)),
         };
         match fit {
@@ -279,7 +271,7 @@ impl Folder {
         let floor = floor.ok_or(ScaleRefusal::NoFeet { found: 0 })?;
         let mut rays = Vec::new();
         for (frame, grid) in self.grids.iter().enumerate().step_by(self.stride()) {
-            let pose = tracks.camera[self.sample_of(frame, tracks.camera.len())];
+            let pose = tracks.camera()[self.sample_of(frame, tracks.camera().len())];
             for ((row, column), &depth) in grid.indexed_iter() {
                 let [x, y] = ray(
                     &self.setting.intrinsics,
@@ -316,18 +308,17 @@ impl Folder {
     }
 
     fn sample_of(&self, frame: usize, samples: usize) -> usize {
-        let sample = (frame as f64 / self.setting.video_rate * SIGNAL_RATE).round_ties_even();
-        (sample as usize).min(samples.saturating_sub(1))
+        sample_of(frame, self.setting.video_rate, samples)
     }
 
     fn cloud(&self, tracks: &Tracks) -> Vec<Point> {
-        if tracks.camera.is_empty() || self.grids.is_empty() {
+        if tracks.camera().is_empty() || self.grids.is_empty() {
             return Vec::new();
         }
         let frames = self.grids.iter().zip(&self.colors).enumerate();
         let mut points = Vec::new();
         for (frame, (grid, colors)) in frames.step_by(self.stride()) {
-            let pose = &tracks.camera[self.sample_of(frame, tracks.camera.len())];
+            let pose = &tracks.camera()[self.sample_of(frame, tracks.camera().len())];
             points.extend(lift(
                 grid.view(),
                 colors.view(),
@@ -347,7 +338,7 @@ fn foot_heights(tracks: &Tracks) -> Vec<f64> {
         .filter_map(|name| BODY.joint(name))
         .collect();
     tracks
-        .body
+        .body()
         .iter()
         .flat_map(|pose| feet.iter().map(|&j| f64::from(pose[j][2])))
         .collect()

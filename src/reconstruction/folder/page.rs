@@ -2,21 +2,20 @@
 
 use super::{Folder, Manifest};
 use crate::clip::clock::SIGNAL_RATE;
-use crate::geometry::skeleton::JOINTS;
 use crate::reconstruction::depth::stack;
 use crate::reconstruction::export::ply::Point;
 use crate::reconstruction::predictions::ScaleStatus;
-use crate::reconstruction::stitch::{Joints, Stitcher, Tracks, WindowBoundary};
+use crate::reconstruction::stitch::{Tracks, WindowBoundary};
+use crate::reconstruction::track::Timeline;
 use crate::reconstruction::windows::Window;
 use crate::view::scene::Tone;
-use crate::view::{Badge, Confidence, DepthGrids, Fact, Scene, Track};
-use nalgebra::Point3;
-use ndarray::{Array2, Array3, s};
+use crate::view::{Badge, Confidence, DepthGrids, Fact, Part, Scene, Track};
+use ndarray::Array2;
 
 impl Folder {
     pub(super) fn page(
         &self,
-        tracks: Tracks,
+        tracks: &Tracks,
         cloud: Vec<Point>,
         floor: Option<f64>,
         manifest: &Manifest,
@@ -57,7 +56,7 @@ impl Folder {
         if let Some(seam) = worst_seam(&manifest.seams) {
             facts.push(fact("Largest seam", &seam));
         }
-        let mut list = vec![track_of("prediction", false, &tracks)];
+        let mut list = vec![track_of("prediction", false, tracks, self.setting.samples)];
         if let Some(truth) = &self.setting.truth {
             let window = Window {
                 index: 0,
@@ -65,12 +64,14 @@ impl Folder {
                 inside: self.setting.samples,
                 overlap: 0,
             };
-            let mut stitcher = Stitcher::new(self.setting.first);
+            let mut stitcher = self.stitcher.another();
             stitcher.push(&window, truth);
-            list.push(track_of("truth", true, &stitcher.finish().0));
-        }
-        for track in &mut list {
-            fit_length(track, self.setting.samples);
+            list.push(track_of(
+                "truth",
+                true,
+                &stitcher.finish().0,
+                self.setting.samples,
+            ));
         }
         let frames = self.grids.len().min(self.video.len());
         let depth = (frames > 0 && frames == self.video.len()).then(|| DepthGrids {
@@ -108,66 +109,31 @@ fn fact(label: &str, value: &str) -> Fact {
 }
 
 fn worst_seam(seams: &[WindowBoundary]) -> Option<String> {
-    let size = |seam: &WindowBoundary| {
-        let parts = [seam.body_m, seam.camera_m, seam.hands_m];
-        parts.into_iter().flatten().fold(0.0, f64::max)
-    };
+    let size = |seam: &WindowBoundary| seam.metres().map(|(_, v)| v).fold(0.0, f64::max);
     let worst = seams.iter().max_by(|a, b| size(a).total_cmp(&size(b)))?;
-    let part =
-        |name: &str, value: Option<f64>| value.map(|v| format!("{name} {:.0} mm", v * 1000.0));
-    let parts = [
-        part("body", worst.body_m),
-        part("camera", worst.camera_m),
-        part("hands", worst.hands_m),
-    ];
-    let parts: Vec<String> = parts.into_iter().flatten().collect();
+    let part = |(name, metres): (&str, f64)| format!("{name} {:.0} mm", metres * 1000.0);
+    let parts: Vec<String> = worst.metres().map(part).collect();
     (!parts.is_empty()).then(|| format!("at {:.1} s: {}", worst.at_seconds, parts.join(", ")))
 }
 
-/// A track of the page: hands are moved to the world, gaze stays in the image.
-fn track_of(name: &str, truth: bool, tracks: &Tracks) -> Track {
-    let array = |joints: &[Joints], in_camera: bool| {
-        (!joints.is_empty()).then(|| {
-            Array3::from_shape_fn((joints.len(), JOINTS, 3), |(t, j, k)| {
-                let p = joints[t][j];
-                match tracks.camera.get(t) {
-                    Some(pose) if in_camera => (pose * Point3::from(p.map(f64::from)))[k] as f32,
-                    _ => p[k],
-                }
-            })
-        })
+/// A track of the page, every part as long as the timeline.
+fn track_of(name: &str, truth: bool, tracks: &Tracks, samples: usize) -> Track {
+    let timeline = Timeline {
+        samples,
+        cameras: tracks.camera(),
     };
+    let mut parts: Vec<Part> = tracks
+        .iter()
+        .flat_map(|(_, t)| t.parts(&timeline))
+        .collect();
+    for part in &mut parts {
+        let held = std::mem::take(&mut part.values);
+        let known = |at: (usize, usize)| held.get(at).copied().unwrap_or(f32::NAN);
+        part.values = Array2::from_shape_fn((samples, held.ncols()), known);
+    }
     Track {
         name: name.into(),
         truth,
-        camera: (!tracks.camera.is_empty())
-            .then(|| tracks.camera.iter().copied().map(Some).collect()),
-        gaze: (!tracks.gaze.is_empty())
-            .then(|| Array2::from_shape_fn((tracks.gaze.len(), 2), |(t, k)| tracks.gaze[t][k])),
-        body: array(&tracks.body, false),
-        left_hand: array(&tracks.left_hand, true),
-        right_hand: array(&tracks.right_hand, true),
-    }
-}
-
-/// Cuts or fills (with unknown) every part of a track to the timeline.
-fn fit_length(track: &mut Track, samples: usize) {
-    if let Some(camera) = &mut track.camera {
-        camera.resize(samples, None);
-    }
-    if let Some(gaze) = &mut track.gaze {
-        let held = std::mem::replace(gaze, Array2::from_elem((samples, 2), f32::NAN));
-        let n = held.nrows().min(samples);
-        gaze.slice_mut(s![..n, ..]).assign(&held.slice(s![..n, ..]));
-    }
-    for joints in [&mut track.body, &mut track.left_hand, &mut track.right_hand]
-        .into_iter()
-        .flatten()
-    {
-        let held = std::mem::replace(joints, Array3::from_elem((samples, JOINTS, 3), f32::NAN));
-        let n = held.shape()[0].min(samples);
-        joints
-            .slice_mut(s![..n, .., ..])
-            .assign(&held.slice(s![..n, .., ..]));
+        parts,
     }
 }

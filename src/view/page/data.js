@@ -19,15 +19,12 @@ function bytesOf(name) {
 }
 const floatsOf = name => { const b = bytesOf(name); return b && new Float32Array(b.buffer, 0, b.length >> 2); };
 
-// A track is one version of the wearer: the prediction, or the truth beside it.
-const tracks = manifest.tracks.map(track => ({
-  ...track,
-  camera: floatsOf(track.name + "-camera"),   // [samples, 7] position, quaternion x y z w
-  gaze: floatsOf(track.name + "-gaze"),       // [samples, 2] image in [0, 1], NaN where unknown
-  body: floatsOf(track.name + "-body"),       // [samples, 21, 3]
-  left_hand: floatsOf(track.name + "-left_hand"),
-  right_hand: floatsOf(track.name + "-right_hand"),
-}));
+// A track is one version of the wearer: the prediction, or the truth beside it. Its parts are modalities, each with the kind of
+// its drawing and `width` numbers per sample, NaN where unknown.
+const tracks = manifest.tracks.map(track => {
+  const parts = track.parts.map(part => ({ ...part, values: floatsOf(track.name + "-" + part.name) }));
+  return { ...track, parts, camera: parts.find(part => part.kind === "camera") };
+});
 
 const depth = (() => {
   const info = manifest.depth; if (!info) return null;
@@ -93,13 +90,14 @@ function lookAt(eye, target, up) {
   x = unit(x); const y = cross(z, x);
   return new Float32Array([x[0], y[0], z[0], 0, x[1], y[1], z[1], 0, x[2], y[2], z[2], 0, -dot(x, eye), -dot(y, eye), -dot(z, eye), 1]);
 }
-function pose(track, sample) {
-  if (!track.camera) return null;
-  const at = sample * 7, p = Array.from(track.camera.subarray(at, at + 3)), q = Array.from(track.camera.subarray(at + 3, at + 7));
+// Position and quaternion x y z w of a part's row.
+function poseOf(part, sample) {
+  const at = sample * 7, p = Array.from(part.values.subarray(at, at + 3)), q = Array.from(part.values.subarray(at + 3, at + 7));
   return finite(p) && finite(q) ? { p, q } : null;
 }
-function joint(values, sample, index) {
-  const at = (sample * 21 + index) * 3;
-  const p = [values[at], values[at + 1], values[at + 2]];
+const pose = (track, sample) => track.camera ? poseOf(track.camera, sample) : null;
+function joint(part, sample, index) {
+  const at = sample * part.width + index * 3;
+  const p = [part.values[at], part.values[at + 1], part.values[at + 2]];
   return finite(p) ? p : null;
 }

@@ -1,11 +1,15 @@
 // The page: layers, cameras, timeline, keyboard.
 
 const PALETTE = { body: [1.0, 0.71, 0.33], left_hand: [0.42, 0.77, 1.0], right_hand: [1.0, 0.48, 0.66], gaze: [0.55, 0.94, 0.55], camera: [0.9, 0.92, 0.95] };
+const OTHERS = [[0.75, 0.6, 1.0], [0.4, 0.9, 0.85], [1.0, 0.85, 0.4], [0.95, 0.55, 0.45]];
+const KEYS = { body: "b", hands: "h", gaze: "g", camera: "c" };
+const names = [...new Set(tracks.flatMap(t => t.parts.map(p => p.layer)))];
+const others = names.filter(name => !KEYS[name]);
+const colorOf = part => PALETTE[part.name] || OTHERS[others.indexOf(part.layer) % OTHERS.length] || PALETTE.camera;
+const title = name => name.charAt(0).toUpperCase() + name.slice(1).replaceAll("_", " ");
+const partsOf = layer => tracks.flatMap(t => t.parts).filter(p => p.layer === layer);
 const layers = [
-  { id: "body", key: "b", label: "Body", color: PALETTE.body, has: () => tracks.some(t => t.body) },
-  { id: "hands", key: "h", label: "Hands", color: PALETTE.left_hand, has: () => tracks.some(t => t.left_hand || t.right_hand) },
-  { id: "gaze", key: "g", label: "Gaze", color: PALETTE.gaze, has: () => tracks.some(t => t.gaze) },
-  { id: "camera", key: "c", label: "Camera", color: PALETTE.camera, has: () => tracks.some(t => t.camera) },
+  ...[...Object.keys(KEYS).filter(name => names.includes(name)), ...others].map(name => ({ id: name, key: KEYS[name] || "", label: title(name), color: colorOf(partsOf(name)[0]), has: () => true })),
   { id: "depth", key: "d", label: "Depth now", color: [0.6, 0.66, 0.74], has: () => !!depth },
   { id: "cloud", key: "w", label: "World", color: [0.45, 0.5, 0.6], has: () => !!cloud },
   { id: "truth", key: "t", label: "Truth (stippled)", color: [0.8, 0.8, 0.8], has: () => tracks.some(t => t.truth) },
@@ -19,9 +23,9 @@ const touch = () => { state.dirty = true; };
 
 // ---- the scene of one moment ------------------------------------------------------------------------------------------
 
-function capsuleChain(values, sample, bones, color, alpha) {
-  for (const [a, b, radius] of bones) {
-    const p = joint(values, sample, a), q = joint(values, sample, b);
+function capsuleChain(part, sample, color, alpha) {
+  for (const [a, b, radius] of part.bones) {
+    const p = joint(part, sample, a), q = joint(part, sample, b);
     if (p && q) limbs.add(p, q, radius, radius * 0.85, color, alpha);
   }
 }
@@ -33,8 +37,8 @@ function frustum(camera, size, color, alpha) {
   const tip = add(scale(add(corners[0], corners[1]), 0.5), rotate(camera.q, [0, -size * 0.18, 0]));
   limbs.add(corners[0], tip, 0.004, 0.004, color, alpha); limbs.add(tip, corners[1], 0.004, 0.004, color, alpha);
 }
-function gazeRay(track, sample) {
-  const camera = pose(track, sample), u = track.gaze[sample * 2], v = track.gaze[sample * 2 + 1];
+function gazeRay(track, part, sample) {
+  const camera = pose(track, sample), u = part.values[sample * 2], v = part.values[sample * 2 + 1];
   if (!camera || !Number.isFinite(u) || !Number.isFinite(v)) return null;
   const [fx, fy, cx, cy] = manifest.lens;
   let reach = 1.5;
@@ -44,19 +48,32 @@ function gazeRay(track, sample) {
   }
   return { from: camera.p, to: add(camera.p, rotate(camera.q, scale([(u - cx) / fx, (v - cy) / fy, 1], reach))) };
 }
+function path(part, sample, color, alpha) {
+  let before = null; const step = Math.max(1, Math.floor(samples / 1200));
+  for (let s = 0; s < samples; s += step) { const at = poseOf(part, s); if (at && before) limbs.add(before.p, at.p, 0.006, 0.006, s <= sample ? color : [0.35, 0.38, 0.44], alpha); before = at; }
+}
+const inside = () => state.camera === "first";
+const draw = {
+  camera(track, part, sample, color, alpha) {
+    path(part, sample, color, alpha);
+    const now = poseOf(part, sample); if (now && !inside()) frustum(now, 0.16, color, alpha);
+  },
+  pose(track, part, sample, color, alpha) {
+    path(part, sample, color, alpha);
+    const now = poseOf(part, sample); if (!now) return;
+    [[0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]].forEach((axis, k) => limbs.add(now.p, add(now.p, rotate(now.q, axis)), 0.008, 0.008, color.map((c, i) => i === k ? 1 : c * 0.5), alpha));
+  },
+  point(track, part, sample, color, alpha) {
+    const ray = gazeRay(track, part, sample); if (!ray) return;
+    if (!inside()) limbs.add(ray.from, ray.to, 0.005, 0.005, color, alpha);
+    limbs.add(ray.to, ray.to, 0.03, 0.03, color, alpha);
+  },
+  // The own body would hide what the first person sees; the hands are part of it.
+  joints(track, part, sample, color, alpha) { if (part.in_image || !inside()) capsuleChain(part, sample, color, alpha); },
+  plot() {},
+};
 function drawTrack(track, sample) {
-  const alpha = track.truth ? 0.5 : 1;
-  if (shown("body") && track.body && state.camera !== "first") capsuleChain(track.body, sample, manifest.body_bones, PALETTE.body, alpha);
-  if (shown("hands")) for (const side of ["left_hand", "right_hand"]) if (track[side]) capsuleChain(track[side], sample, manifest.hand_bones, PALETTE[side], alpha);
-  if (shown("camera") && track.camera) {
-    let before = null; const step = Math.max(1, Math.floor(samples / 1200));
-    for (let s = 0; s < samples; s += step) { const at = pose(track, s); if (at && before) limbs.add(before.p, at.p, 0.006, 0.006, s <= sample ? PALETTE.camera : [0.35, 0.38, 0.44], alpha); before = at; }
-    const now = pose(track, sample); if (now && state.camera !== "first") frustum(now, 0.16, PALETTE.camera, alpha);
-  }
-  if (shown("gaze") && track.gaze) {
-    const ray = gazeRay(track, sample);
-    if (ray) { if (state.camera !== "first") limbs.add(ray.from, ray.to, 0.005, 0.005, PALETTE.gaze, alpha); limbs.add(ray.to, ray.to, 0.03, 0.03, PALETTE.gaze, alpha); }
-  }
+  for (const part of track.parts) if (shown(part.layer)) draw[part.kind](track, part, sample, colorOf(part), track.truth ? 0.5 : 1);
 }
 function drawFloor() {
   const z = manifest.floor; if (z == null) return;
@@ -102,21 +119,52 @@ function renderVideo() {
   if (video && !image) return;
   for (const track of visibleTracks()) {
     ink.setLineDash(track.truth ? [3, 4] : []);
-    if (shown("hands")) for (const side of ["left_hand", "right_hand"]) if (track[side]) projectHand(track, side, size);
-    if (!shown("gaze") || !track.gaze) continue;
-    const u = track.gaze[state.sample * 2], v = track.gaze[state.sample * 2 + 1];
-    if (!Number.isFinite(u) || !Number.isFinite(v)) continue;
-    ink.strokeStyle = "#8cf08c"; ink.lineWidth = 3; ink.beginPath(); ink.arc(u * size, v * size, 13, 0, 7); ink.stroke();
+    for (const part of track.parts) if (shown(part.layer)) {
+      ink.strokeStyle = `rgb(${colorOf(part).map(c => c * 255)})`;
+      if (part.kind === "joints" && part.in_image) project(track, part, size);
+      if (part.kind !== "point") continue;
+      const u = part.values[state.sample * 2], v = part.values[state.sample * 2 + 1];
+      if (Number.isFinite(u) && Number.isFinite(v)) { ink.lineWidth = 3; ink.beginPath(); ink.arc(u * size, v * size, 13, 0, 7); ink.stroke(); }
+    }
   }
   ink.setLineDash([]);
 }
-function projectHand(track, side, size) {
+function project(track, part, size) {
   const camera = pose(track, state.sample); if (!camera) return;
   const [fx, fy, cx, cy] = manifest.lens, back = [-camera.q[0], -camera.q[1], -camera.q[2], camera.q[3]];
-  const place = index => { const p = joint(track[side], state.sample, index); if (!p) return null; const c = rotate(back, sub(p, camera.p)); return c[2] > 0.05 ? [(c[0] / c[2] * fx + cx) * size, (c[1] / c[2] * fy + cy) * size] : null; };
-  ink.strokeStyle = side === "left_hand" ? "#6cc5ff" : "#ff7aa8"; ink.lineWidth = 2; ink.beginPath();
-  for (const [a, b] of manifest.hand_bones) { const p = place(a), q = place(b); if (p && q) { ink.moveTo(...p); ink.lineTo(...q); } }
+  const place = index => { const p = joint(part, state.sample, index); if (!p) return null; const c = rotate(back, sub(p, camera.p)); return c[2] > 0.05 ? [(c[0] / c[2] * fx + cx) * size, (c[1] / c[2] * fy + cy) * size] : null; };
+  ink.lineWidth = 2; ink.beginPath();
+  for (const [a, b] of part.bones) { const p = place(a), q = place(b); if (p && q) { ink.moveTo(...p); ink.lineTo(...q); } }
   ink.stroke();
+}
+
+// ---- curves of what has no place in the scene -------------------------------------------------------------------------
+
+const plots = names.map(layer => ({ layer, parts: tracks.flatMap(t => t.parts.filter(p => p.layer === layer && p.kind === "plot").map(p => ({ ...p, truth: t.truth }))) })).filter(p => p.parts.length);
+for (const plot of plots) {
+  const [{ channels, units, width }] = plot.parts;
+  let [low, high] = [Infinity, -Infinity];
+  for (const part of plot.parts) for (const v of part.values) if (Number.isFinite(v)) { low = Math.min(low, v); high = Math.max(high, v); }
+  Object.assign(plot, { low, span: Math.max(high - low, 1e-9) });
+  plot.canvas = make("canvas", ""); plot.canvas.height = 64; plot.canvas.className = "plot";
+  const figure = make("figure", ""); figure.append(make("figcaption", `${title(plot.layer)}: ${channels.join(", ") || width + " channels"}${units.length ? " (" + [...new Set(units)].join(", ") + ")" : ""}`), plot.canvas);
+  document.getElementById("plots").append(figure);
+}
+function drawPlots() {
+  for (const { canvas, parts, layer, low, span } of plots) {
+    canvas.parentElement.hidden = !shown(layer);
+    const w = canvas.width = Math.max(1, canvas.clientWidth), h = canvas.height, pen = canvas.getContext("2d"), step = Math.max(1, Math.floor(samples / (2 * w)));
+    for (const part of parts) {
+      if (part.truth && !shown("truth")) continue;
+      pen.setLineDash(part.truth ? [3, 3] : []);
+      for (let c = 0; c < part.width; c++) {
+        pen.strokeStyle = `hsl(${c * 67 + 200} 70% 65%)`; pen.beginPath(); let down = false;
+        for (let s = 0; s < samples; s += step) { const v = part.values[s * part.width + c]; if (!Number.isFinite(v)) { down = false; continue; } const at = [s / Math.max(samples - 1, 1) * w, h - 3 - (v - low) / span * (h - 6)]; if (down) pen.lineTo(...at); else pen.moveTo(...at); down = true; }
+        pen.stroke();
+      }
+    }
+    pen.setLineDash([]); pen.strokeStyle = "#fff8"; const x = state.sample / Math.max(samples - 1, 1) * w; pen.beginPath(); pen.moveTo(x, 0); pen.lineTo(x, h); pen.stroke();
+  }
 }
 
 // ---- controls ---------------------------------------------------------------------------------------------------------
@@ -131,7 +179,7 @@ for (const fact of manifest.facts) $("facts").append(make("dt", fact.label), mak
 for (const layer of layers) {
   const button = make("button", layer.label); const swatch = make("span", "", "swatch");
   swatch.style.background = `rgb(${layer.color.map(c => c * 255)})`; button.prepend(swatch);
-  button.title = `Show or hide (${layer.key})`; button.onclick = () => toggle(layer.id); layer.button = button; $("toggles").append(button);
+  button.title = layer.key ? `Show or hide (${layer.key})` : "Show or hide"; button.onclick = () => toggle(layer.id); layer.button = button; $("toggles").append(button);
 }
 function toggle(id) { const l = layers.find(x => x.id === id); if (l) { l.on = !l.on; l.button.setAttribute("aria-pressed", l.on); touch(); } }
 for (const l of layers) l.button.setAttribute("aria-pressed", "true");
@@ -144,7 +192,7 @@ $("play").onclick = () => play(!state.playing);
 $("speed").onchange = e => { state.speed = +e.target.value; };
 $("help-button").onclick = () => $("help").showModal();
 const keys = [["Space", "play or pause"], ["Left / Right", "one frame back or on (Shift: one second)"], ["Home / End", "start or end"], ["1 2 3", "orbit, follow, first person"],
-  ...layers.map(l => [l.key.toUpperCase(), "show or hide: " + l.label]), ["Drag / wheel", "turn, zoom (right drag or two fingers: move)"], ["?", "this list"]];
+  ...layers.filter(l => l.key).map(l => [l.key.toUpperCase(), "show or hide: " + l.label]), ["Drag / wheel", "turn, zoom (right drag or two fingers: move)"], ["?", "this list"]];
 for (const [key, does] of keys) { const row = document.createElement("tr"), cell = document.createElement("td"); cell.append(make("kbd", key)); row.append(cell, make("td", does)); $("keys").append(row); }
 addEventListener("keydown", e => {
   if (e.target.tagName === "SELECT" || e.ctrlKey || e.metaKey || e.altKey) return;
@@ -202,7 +250,7 @@ function frame(now) {
   }
   last = now;
   if (state.dirty) {
-    state.dirty = false; render(); renderVideo();
+    state.dirty = false; render(); renderVideo(); drawPlots();
     $("time").value = state.sample; $("clock").textContent = `${clockText(state.sample / rate)} / ${clockText((samples - 1) / rate)}`;
   }
   requestAnimationFrame(frame);
