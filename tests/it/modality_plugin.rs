@@ -1,17 +1,32 @@
 //! Modalities that `src/` does not know, from clips to a row of a table: one declared in YAML, one computed by a plug-in crate.
 
+use self::object_pose::{OBJECT, ObjectPath, ObjectTrack};
 use crate::run_text::{failures, run_text};
+use nalgebra::{UnitQuaternion, Vector3};
+use reviv::clip::store::ClipSet;
+use reviv::clip::{CAMERA, CameraTrack, Clip};
 use reviv::evaluation::table::{RowKind, Table};
 use reviv::experiment::catalog::Catalog;
 use reviv::experiment::load::{Request, load};
+use reviv::formats::npz::Npz;
+use reviv::geometry::rigid::{Rigid, level_camera};
+use reviv::reconstruction::folder::{FOLDER, PAGE};
+use reviv::reconstruction::predictions::Predictions;
+use reviv::reconstruction::stitch::Stitcher;
+use reviv::reconstruction::windows::windows;
 use reviv::run::State;
 use reviv::run::execute::cache_of;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 
-// The example crate's own file: this test program links it in as the crate's binary does.
+// The example crate's own files: this test program links them in as the crate's binary does.
+#[path = "../../examples/plugin_modality/src/feet_contact.rs"]
+mod feet_contact;
 #[path = "../../examples/plugin_modality/src/head_turn.rs"]
 mod head_turn;
+#[path = "../../examples/plugin_modality/src/object_pose.rs"]
+#[allow(non_snake_case, reason = "transforms are named `T_to_from`")]
+mod object_pose;
 
 const EXPERIMENT: &str = "
 experiment: plugins
@@ -51,6 +66,37 @@ stages:
   predictions: {op: predict, model: mget, clips: clips, inputs: [camera]}
   scores: {op: evaluate, predictions: predictions, clips: clips, suite: {use: world_camera, metrics: []}}
   table: {op: table, scores: [scores]}
+";
+
+const ODD: &str = "
+experiment: odd
+about: A pose of a type of its own and two channels with a metric of their own, from clips to a table and a page.
+stages:
+  clips:
+    op: clips
+    source: {use: world_small, world: {size: 16, rooms: 3}}
+    train: 12
+    validation: 2
+    test: 4
+    declared: [object_pose, feet_contact]
+  tok_object: {op: train_tokenizer, clips: clips, modality: object_pose, tokenizer: {use: vq_temporal_small, codebook: 16, width: 16, depth: 1, heads: 2}, steps: 5, warmup: {steps: 0}}
+  tok_feet: {op: train_tokenizer, clips: clips, modality: feet_contact, tokenizer: {use: vq_temporal_small, codebook: 16, width: 16, depth: 1, heads: 2}, steps: 5, warmup: {steps: 0}}
+  tok_camera: {op: train_tokenizer, clips: clips, modality: camera, tokenizer: {use: vq_temporal_small, codebook: 16, width: 16, depth: 1, heads: 2}, steps: 5, warmup: {steps: 0}}
+  tokens: {op: tokenize, clips: clips, tokenizers: [tok_object, tok_feet, tok_camera], pixels: rgb}
+  mget:
+    op: train_mget
+    tokens: [tokens]
+    size: {use: laptop_small, width: 24, heads: 2, encoder_depth: 1, decoder_depth: 1}
+    masking: {use: dirichlet_mixture, input_tokens: 30, target_tokens: 30}
+    pixels: rgb
+    tubelet: [4, 16, 16]
+    steps: 3
+    batch: 4
+    warmup: {steps: 1}
+  predictions: {op: predict, model: mget, clips: clips, inputs: [pixels]}
+  scores: {op: evaluate, predictions: predictions, clips: clips, suite: {use: world_camera, metrics: []}}
+  table: {op: table, scores: [scores]}
+  view: {op: reconstruct, model: mget, clips: clips, inputs: [pixels]}
 ";
 
 fn run(folder: &Path) -> PathBuf {
@@ -135,6 +181,133 @@ fn the_clock_is_in_the_record_alone(runs: &Path) {
     let (path, _) = made(runs, "predict", "");
     let text = std::fs::read_to_string(path.join("manifest.json")).unwrap();
     assert!(!text.contains("seconds_per_clip"));
+}
+
+#[test]
+fn modalities_of_another_shape_go_from_clips_to_a_table_and_a_page() {
+    let folder = tempfile::tempdir().unwrap();
+    let outcome = run_text(folder.path(), ODD).unwrap_or_else(|report| panic!("{report}"));
+    assert_eq!(outcome.state, State::Done, "{:?}", failures(&outcome));
+    let runs = folder.path().join("runs");
+
+    // Clips hold the plug-in's own type, in shards too.
+    let (path, _) = made(&runs, "clips", "");
+    let clip = ClipSet::open(&path.join("test")).unwrap().clip(0).unwrap();
+    let track = clip.get(OBJECT).unwrap();
+    assert_eq!(track.T_first_object.len(), 60);
+    assert!(track.T_first_object.iter().any(Option::is_some));
+    assert_eq!(clip.signal("feet_contact").unwrap().values.shape(), [60, 2]);
+    let (path, _) = made(&runs, "predict", "");
+    let predicted = Predictions::open(&path).unwrap().load(0).unwrap();
+    assert_eq!(predicted.get(OBJECT).unwrap().T_first_object.len(), 60);
+
+    // Scores, each beside its own baseline and its tokenizer's bound.
+    let (path, _) = made(&runs, "table", "");
+    let text = std::fs::read_to_string(path.join("table.json")).unwrap();
+    let table: Table = serde_json::from_str(&text).unwrap();
+    let columns: Vec<&str> = table.columns.iter().map(|c| c.name.as_str()).collect();
+    let expected = [
+        "feet_contact.accuracy",
+        "object_pose.position",
+        "object_pose.rotation",
+    ];
+    assert_eq!(columns, expected);
+    let has = |label: &str| {
+        let row = table.rows.iter().find(|row| row.label == label);
+        let row = row.unwrap_or_else(|| panic!("no row `{label}`: {:?}", table.rows));
+        row.cells
+            .iter()
+            .map(|cell| cell.value.is_some())
+            .collect::<Vec<bool>>()
+    };
+    assert_eq!(has("reviv"), [true; 3]);
+    assert_eq!(has("tokenizer floor"), [true; 3]);
+    assert_eq!(has("mean value"), [true, false, false]);
+    assert_eq!(has("still object"), [false, true, true]);
+
+    // The reconstruction has arrays of both, and the page draws both beside their truth.
+    let (path, contents) = made(&runs, "reconstruct", "");
+    assert_eq!(
+        contents["modalities"],
+        serde_json::json!(["camera", "feet_contact", "object_pose"])
+    );
+    let path = path.join(FOLDER);
+    let poses = Npz::read(&path.join("object_pose.npz")).unwrap();
+    assert_eq!(poses.get("T_world_object").unwrap().shape, [60, 4, 4]);
+    let feet = Npz::read(&path.join("feet_contact.npz")).unwrap();
+    assert_eq!(feet.get("feet_contact").unwrap().shape, [60, 2]);
+    assert_eq!(feet.get("feet_contact_valid").unwrap().shape, [60]);
+    let manifest = std::fs::read_to_string(path.join("manifest.json")).unwrap();
+    let manifest: Value = serde_json::from_str(&manifest).unwrap();
+    let arrays = manifest["arrays"].as_array().unwrap();
+    let about = |name: &str| arrays.iter().find(|array| array["name"] == name).unwrap();
+    assert_eq!(
+        about("T_world_object")["scale"]["metric"]["by"],
+        "learning from metric data"
+    );
+    assert_eq!(about("feet_contact")["frame"], "body");
+    let page = std::fs::read_to_string(path.join(PAGE)).unwrap();
+    for track in ["prediction", "truth"] {
+        for modality in ["object_pose", "feet_contact"] {
+            assert!(
+                page.contains(&format!("id=\"blob-{track}-{modality}\"")),
+                "{track} {modality}"
+            );
+        }
+    }
+    assert!(
+        page.contains("\"kind\":\"pose\"") && page.contains("\"channels\":[\"left\",\"right\"]")
+    );
+}
+
+#[test]
+fn an_object_that_stands_in_the_world_stands_still_across_windows() {
+    let still = Rigid::translation(0.3, 2.0, -0.4);
+    let camera = |sample: usize| {
+        let t = sample as f64 / 30.0;
+        let turn = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), 0.4 * t);
+        Rigid::from_parts(
+            Vector3::new(t.sin(), 0.8 * t, 0.0).into(),
+            turn * level_camera().rotation,
+        )
+    };
+    let mut stitcher = Stitcher::new(camera(0));
+    let all = windows(5.2, 0.5).unwrap();
+    for window in &all {
+        let first = camera(window.start);
+        let mut clip = Clip::empty("walk", "test");
+        let poses = (window.start..window.start + 60).map(|s| first.inv_mul(&camera(s)));
+        clip.set(
+            CAMERA,
+            CameraTrack {
+                rate: 30.0,
+                T_world_camera: poses.collect(),
+                valid: vec![true; 60],
+                up_world: None,
+                intrinsics: None,
+            },
+        );
+        // One sample of the second window is not known: the first window's counts.
+        let poses = (0..60).map(|t| (window.index != 1 || t != 3).then(|| first.inv_mul(&still)));
+        clip.set(
+            OBJECT,
+            ObjectTrack {
+                rate: 30.0,
+                T_first_object: poses.collect(),
+            },
+        );
+        stitcher.push(window, &clip);
+    }
+    let (tracks, boundaries) = stitcher.finish();
+    let path: &ObjectPath = tracks.get("object_pose").unwrap();
+    assert_eq!(path.T_world_object.len(), 156);
+    for pose in &path.T_world_object {
+        let pose = pose.unwrap();
+        assert!((pose.translation.vector - still.translation.vector).norm() < 1e-9);
+        assert!(pose.rotation.angle() < 1e-7);
+    }
+    assert_eq!(boundaries.len(), all.len() - 1);
+    assert!(boundaries.iter().all(|b| b.others["object_m"] < 1e-9));
 }
 
 #[test]
