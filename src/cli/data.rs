@@ -2,6 +2,7 @@
 
 mod convert;
 mod inspect;
+mod status;
 mod synthesize;
 
 use super::run::{interruptible, progress};
@@ -29,6 +30,7 @@ pub struct Data {
 
 #[derive(Debug, clap::Subcommand)]
 enum Command {
+    Status(status::StatusCommand),
     Inspect(inspect::Inspect),
     Convert(convert::Convert),
     Synthesize(synthesize::Synthesize),
@@ -37,6 +39,7 @@ enum Command {
 impl super::Run for Data {
     fn run(self, terminal: &Terminal) -> Result<(), Failure> {
         match self.command {
+            Command::Status(command) => command.run(terminal),
             Command::Inspect(command) => command.run(terminal),
             Command::Convert(command) => command.run(terminal),
             Command::Synthesize(command) => command.run(terminal),

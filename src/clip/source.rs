@@ -3,6 +3,7 @@
 use crate::clip::Clip;
 use crate::formats::ReadError;
 use crate::modality::ClipFormat;
+use std::collections::BTreeMap;
 use std::ops::Range;
 
 /// A named list of clips, made on request.
@@ -32,6 +33,11 @@ pub trait ClipSource: Send + Sync {
     /// Stretches of time that belong together, by name, in the order of their clips: what is divided into splits.
     fn recordings(&self) -> Vec<(String, Range<usize>)> {
         vec![(self.name().to_owned(), 0..self.len())]
+    }
+
+    /// For which split each recording is meant by whoever published it, where they say so: `train`, `validation` or `test`.
+    fn splits(&self) -> BTreeMap<String, &'static str> {
+        BTreeMap::new()
     }
 
     /// Recordings that are here and give no clips, each with the reason.

@@ -33,6 +33,8 @@ pub struct Recordings {
     excluded: Vec<Excluded>,
     /// What recordings lack, with the number of those that lack it.
     notes: BTreeMap<String, usize>,
+    /// Official splits, by recording.
+    splits: BTreeMap<String, &'static str>,
     /// First clip of every recording, and the number of all clips at the end.
     starts: Vec<usize>,
     names: Vec<String>,
@@ -125,6 +127,7 @@ impl Recordings {
             folders: opened,
             excluded,
             notes,
+            splits: BTreeMap::new(),
             starts,
             names,
             modalities,
@@ -138,6 +141,13 @@ impl Recordings {
     #[must_use]
     pub fn with_declared(mut self, declared: &[DeclaredSettings]) -> Self {
         self.declared = declared.to_vec();
+        self
+    }
+
+    /// Adds the official split of recordings.
+    #[must_use]
+    pub fn with_splits(mut self, splits: BTreeMap<String, &'static str>) -> Self {
+        self.splits = splits;
         self
     }
 
@@ -207,6 +217,10 @@ impl ClipSource for Recordings {
     fn recordings(&self) -> Vec<(String, Range<usize>)> {
         let ranges = self.starts.windows(2).map(|pair| pair[0]..pair[1]);
         self.names.iter().cloned().zip(ranges).collect()
+    }
+
+    fn splits(&self) -> BTreeMap<String, &'static str> {
+        self.splits.clone()
     }
 
     fn excluded(&self) -> Vec<Excluded> {

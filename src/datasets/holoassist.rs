@@ -10,6 +10,7 @@ mod rows;
 mod tables;
 
 use super::ReadError;
+use super::csv::Lines;
 use super::dataset::{Recordings, find};
 use super::recording::{
     ColourFrames, CutSettings, GazeSample, JointFrame, MountedCamera, Recording,
@@ -19,6 +20,7 @@ use crate::geometry::camera::{Camera, Lens, Pinhole};
 use crate::video::Video;
 use crate::video::image::Image;
 use nalgebra::{Isometry3, Point3, Vector3};
+use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use tables::{Intrinsics, PoseRow};
 
@@ -40,7 +42,42 @@ pub fn source(root: &Path, settings: CutSettings) -> Result<Recordings, ReadErro
         "HoloAssist session (a folder with `Export_py`)",
         is_session,
     )?;
-    Recordings::new("holoassist", folders, settings, |folder, _| open(folder))
+    let (splits, absent) = official(root, &folders)?;
+    let recordings = Recordings::new("holoassist", folders, settings, |folder, _| open(folder))?
+        .with_splits(splits);
+    Ok(if absent > 0 {
+        recordings.with_note("sessions of `data_split/` that are not on disk", absent)
+    } else {
+        recordings
+    })
+}
+
+/// The split of each session by the lists in `data_split/`, and how many that are listed are not here.
+fn official(
+    root: &Path,
+    folders: &[PathBuf],
+) -> Result<(BTreeMap<String, &'static str>, usize), ReadError> {
+    let here: BTreeSet<String> = folders
+        .iter()
+        .filter_map(|folder| folder.file_name())
+        .map(|name| name.to_string_lossy().into_owned())
+        .collect();
+    let (mut splits, mut absent) = (BTreeMap::new(), 0);
+    for (file, split) in [("train", "train"), ("val", "validation"), ("test", "test")] {
+        let path = root.join(format!("data_split/{file}-v1_2.txt"));
+        if !path.is_file() {
+            continue;
+        }
+        for line in Lines::open(&path)? {
+            let name = line?.1.trim().to_owned();
+            if here.contains(&name) {
+                splits.insert(name, split);
+            } else if !name.is_empty() {
+                absent += 1;
+            }
+        }
+    }
+    Ok((splits, absent))
 }
 
 /// Whether a folder is a session.
@@ -77,7 +114,7 @@ pub fn open(folder: &Path) -> Result<Recording, ReadError> {
     if let Some(path) = video_of(&export) {
         let video = Video::open(&path)?;
         size = Some((video.info().width, video.info().height));
-        match start_of(&export, &mut recording.notes)? {
+        match start_of(&export)? {
             Some(start) => recording.colour = rows_as_frames(video, start, &poses).map(boxed),
             None => recording.notes.push(
                 "there is no `Video/VideoMp4Timing.txt`, which says when the video begins: no pictures".to_owned(),
@@ -142,16 +179,9 @@ fn video_of(export: &Path) -> Option<PathBuf> {
         .find(|path| path.is_file())
 }
 
-fn start_of(export: &Path, notes: &mut Vec<String>) -> Result<Option<i64>, ReadError> {
+fn start_of(export: &Path) -> Result<Option<i64>, ReadError> {
     let path = export.join("Video/VideoMp4Timing.txt");
-    if !path.is_file() {
-        return Ok(None);
-    }
-    let (start, end) = tables::timing(&path)?;
-    if end.is_some_and(|end| end <= start) {
-        notes.push("`Video/VideoMp4Timing.txt` ends before it begins".to_owned());
-    }
-    Ok(Some(start))
+    path.is_file().then(|| tables::timing(&path)).transpose()
 }
 
 /// The camera of the stored pictures. The small video is the full one resized, with a factor per axis.

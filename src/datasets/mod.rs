@@ -8,7 +8,8 @@
 //! * one file per data set: [`adt`], [`hot3d`], [`nymeria`], [`ego_exo4d`], [`holoassist`], [`egogen`]; [`mps`] (any Aria
 //!   recording), [`neutral`] (the folder format that any data set can be written as), [`egom2p`] (the ancestors' layout)
 //! * [`dataset`] (many recordings), [`open`] (whatever a path holds), [`split`] (for training, for the test),
-//!   [`convert`] into [`shards`], which are a source again, [`survey`] (a look at what is there)
+//!   [`convert`] into [`shards`], which are a source again, [`survey`] (a look at what is there),
+//!   [`status`] (how much there is)
 //!
 //! A further data set is one file that fills a [`recording::Recording`], and one line in [`open::Dataset`].
 
@@ -33,6 +34,7 @@ mod pipeline;
 pub mod recording;
 pub mod shards;
 pub mod split;
+pub mod status;
 pub mod survey;
 pub mod track;
 pub mod umetrack;

@@ -4,6 +4,7 @@
 use super::{ClipSource, Excluded, Outcome, ReadError};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 use std::ops::Range;
 use std::sync::Arc;
 
@@ -17,10 +18,12 @@ pub struct SplitSettings {
     /// The share of recordings for the test.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub test: f64,
-    /// These recordings are for validation, whatever the shares say.
+    /// These recordings are for validation, whatever the shares say. `P0001_*` stands for all whose names begin so.
     pub validation_recordings: Vec<String>,
-    /// These recordings are for the test, whatever the shares say.
+    /// These recordings are for the test, whatever the shares say. `P0001_*` stands for all whose names begin so.
     pub test_recordings: Vec<String>,
+    /// Recordings for which the data set itself names a split belong there (the lists of HoloAssist); the shares divide the others.
+    pub official: bool,
 }
 
 impl Default for SplitSettings {
@@ -30,7 +33,16 @@ impl Default for SplitSettings {
             test: 0.1,
             validation_recordings: Vec::new(),
             test_recordings: Vec::new(),
+            official: false,
         }
+    }
+}
+
+/// Whether an entry of the settings names this recording.
+fn names(entry: &str, recording: &str) -> bool {
+    match entry.strip_suffix('*') {
+        Some(start) => recording.starts_with(start),
+        None => entry == recording,
     }
 }
 
@@ -51,16 +63,22 @@ impl SplitSettings {
         Some(("test_recordings", reason))
     }
 
-    fn of(&self, recording: &str) -> &'static str {
-        if self.test_recordings.iter().any(|name| name == recording) {
-            return "test";
+    /// The split of a recording that is not one of chance: named in the settings, or by whoever published it.
+    fn fixed(&self, recording: &str, official: Option<&'static str>) -> Option<&'static str> {
+        let named = |list: &[String]| list.iter().any(|entry| names(entry, recording));
+        if named(&self.test_recordings) {
+            return Some("test");
         }
-        if self
-            .validation_recordings
-            .iter()
-            .any(|name| name == recording)
-        {
-            return "validation";
+        if named(&self.validation_recordings) {
+            return Some("validation");
+        }
+        official.filter(|_| self.official)
+    }
+
+    /// The split of a recording; `official` is what whoever published it says.
+    pub fn of(&self, recording: &str, official: Option<&'static str>) -> &'static str {
+        if let Some(split) = self.fixed(recording, official) {
+            return split;
         }
         let hash = blake3::hash(recording.as_bytes());
         let mut first = [0; 8];
@@ -87,12 +105,13 @@ pub fn divide(
     asked: &[(&'static str, u64)],
 ) -> Result<Vec<(&'static str, Vec<usize>)>, ReadError> {
     let recordings = source.recordings();
+    let official = source.splits();
     let named = settings
         .validation_recordings
         .iter()
         .chain(&settings.test_recordings);
     for name in named {
-        if !recordings.iter().any(|(known, _)| known == name) {
+        if !name.ends_with('*') && !recordings.iter().any(|(known, _)| known == name) {
             let some: Vec<&str> = recordings.iter().take(8).map(|(n, _)| n.as_str()).collect();
             return Err(ReadError::Settings(format!(
                 "`{}` has no recording `{name}`; it has {}{}",
@@ -111,7 +130,7 @@ pub fn divide(
     };
     match (asked, recordings.as_slice()) {
         ([(only, _)], _) => give(only, 0..source.len()),
-        (_, [(_, all)]) => {
+        (_, [(name, all)]) if settings.fixed(name, official.get(name).copied()).is_none() => {
             let cut = |share: f64| all.start + (all.len() as f64 * share).round() as usize;
             let (a, b) = (
                 cut(1.0 - settings.validation - settings.test),
@@ -123,7 +142,8 @@ pub fn divide(
         }
         _ => {
             for (name, clips) in recordings {
-                give(settings.of(&name), clips);
+                let official = official.get(&name).copied();
+                give(settings.of(&name, official), clips);
             }
         }
     }
@@ -256,6 +276,52 @@ mod tests {
             message.contains("take_9") && message.contains("take_4"),
             "{message}"
         );
+    }
+
+    #[test]
+    fn participants_and_official_lists_decide_before_chance() {
+        struct Listed(Fake);
+        impl ClipSource for Listed {
+            fn name(&self) -> &str {
+                self.0.name()
+            }
+            fn len(&self) -> usize {
+                self.0.len()
+            }
+            fn modalities(&self) -> Vec<String> {
+                Vec::new()
+            }
+            fn recordings(&self) -> Vec<(String, Range<usize>)> {
+                self.0.recordings()
+            }
+            fn splits(&self) -> BTreeMap<String, &'static str> {
+                BTreeMap::from([
+                    ("take_0".to_owned(), "validation"),
+                    ("take_10".to_owned(), "test"),
+                ])
+            }
+            fn clip(&self, index: usize) -> Result<Outcome, ReadError> {
+                self.0.clip(index)
+            }
+        }
+        let mut settings = SplitSettings {
+            validation: 0.0,
+            test: 0.0,
+            test_recordings: vec!["take_1*".to_owned()],
+            official: true,
+            ..SplitSettings::default()
+        };
+        let parts = divide(&Listed(Fake::of(12)), &settings, &ALL).unwrap();
+        let counts = |parts: &[(&str, Vec<usize>)]| [0, 1, 2].map(|k| parts[k].1.len());
+        // take_1, take_10 and take_11 by name, take_0 by list.
+        assert_eq!(counts(&parts), [80, 10, 25]);
+        settings.official = false;
+        let parts = divide(&Listed(Fake::of(12)), &settings, &ALL).unwrap();
+        assert_eq!(counts(&parts), [90, 0, 25]);
+        // A single recording that is listed is not cut in time.
+        settings.official = true;
+        let parts = divide(&Listed(Fake::of(1)), &settings, &ALL).unwrap();
+        assert_eq!(counts(&parts), [0, 10, 0]);
     }
 
     #[test]

@@ -36,6 +36,7 @@ mod kill_binary;
 mod language;
 mod language_ops;
 mod layouts;
+mod layouts_bad;
 mod plugins;
 mod rules;
 mod run;

@@ -202,16 +202,19 @@ pub(super) fn intrinsics(path: &Path) -> Result<Intrinsics, ReadError> {
     found.ok_or_else(|| ReadError::malformed(path, Position::Line(1), "the file is empty"))
 }
 
-/// The ticks at which the video starts and, if it is said, ends: a line each.
-pub(super) fn timing(path: &Path) -> Result<(i64, Option<i64>), ReadError> {
-    let mut ticks = Vec::new();
+/// The tick at which the video starts: the first line; the second is where it ends.
+pub(super) fn timing(path: &Path) -> Result<i64, ReadError> {
+    let mut ticks: Vec<i64> = Vec::new();
     each_line(path, |row| {
-        ticks.push(row.tick(0)?);
+        let tick = row.tick(0)?;
+        if ticks.last().is_some_and(|before| *before > tick) {
+            return Err(row.error("the video ends before it begins".to_owned()));
+        }
+        ticks.push(tick);
         Ok(())
     })?;
-    let start = ticks
+    ticks
         .first()
         .copied()
-        .ok_or_else(|| ReadError::malformed(path, Position::Line(1), "the file is empty"))?;
-    Ok((start, ticks.get(1).copied()))
+        .ok_or_else(|| ReadError::malformed(path, Position::Line(1), "the file is empty"))
 }

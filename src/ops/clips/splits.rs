@@ -64,10 +64,15 @@ pub(super) fn parts(
     let mut parts: Vec<Part> = Vec::new();
     for (split, clips) in divided {
         if clips.is_empty() {
+            // A recording that cannot be read may be why.
+            let excluded = source.excluded();
+            let left_out = excluded.first().map_or_else(String::new, |first| {
+                format!(", {} left out: {}", excluded.len(), first.reason)
+            });
             return Err(StageError::Input {
                 code: Code::E0601,
                 message: format!(
-                    "no recording for `{split}`: {} recordings, {} clips in all",
+                    "no recording for `{split}`: {} recordings, {} clips in all{left_out}",
                     source.recordings().len(),
                     source.len()
                 ),
