@@ -4,7 +4,6 @@
 use super::{ClipSource, Excluded, Outcome, ReadError};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use std::collections::BTreeMap;
 use std::ops::Range;
 use std::sync::Arc;
 
@@ -204,6 +203,7 @@ impl ClipSource for Chosen {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::collections::BTreeMap;
 
     /// Recordings of ten clips each.
     struct Fake(Vec<String>);

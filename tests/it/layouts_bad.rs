@@ -310,17 +310,17 @@ fn a_session_without_pictures_or_flags_gives_camera_gaze_and_hands() {
         let Outcome::Clip(clip) = source.clip(0).unwrap() else {
             panic!("dropped")
         };
-        let hand = clip.left_hand.unwrap();
+        let hand = clip.left_hand().unwrap();
         assert!(hand.valid.iter().all(|valid| *valid));
         // The wrist is joint 1 of the file: 0.5 m ahead of the world's origin, 9 cm to the right of it, 10 cm below the eyes.
         let wrist = [0.09, 0.1, 0.5];
         for (k, expected) in wrist.into_iter().enumerate() {
             assert!((hand.joints[[0, 0, k]] - expected).abs() < 1e-6, "{k}");
         }
-        let gaze = clip.gaze.unwrap();
+        let gaze = clip.gaze().unwrap();
         assert!((gaze.points[[30, 0]] - 0.5).abs() < 1e-6 && gaze.valid[30]);
         assert_eq!(
-            clip.camera.unwrap().valid.iter().filter(|v| **v).count(),
+            clip.camera().unwrap().valid.iter().filter(|v| **v).count(),
             60
         );
     }
