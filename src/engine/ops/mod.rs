@@ -5,13 +5,14 @@
 
 mod conv_window;
 mod fused;
-mod gemm;
 mod nearest;
 mod unfused;
 mod vector;
 
 pub use conv_window::ConvWindow;
 pub use nearest::nearest;
+/// Matrix products on slices of the host.
+pub use reviv_gemm as gemm;
 
 use burn::tensor::{Int, Tensor, TensorData};
 

@@ -1,8 +1,8 @@
-//! `x W^T + b`: the bias is where the product is accumulated onto.
+//! `x W^T + b`.
 
 use rayon::prelude::*;
 
-use super::super::gemm::{Matrix, Threads, gemm_into};
+use super::super::gemm::{Matrix, Threads, product};
 use super::{Array, Kernel, Saved, vector};
 
 /// Rows per partial sum of the bias gradient.
@@ -16,17 +16,10 @@ impl Kernel for Linear {
         let inputs = x.width();
         let outputs = weight.shape()[0];
         let rows = x.values().len() / inputs;
-        let mut y = vec![0.0; rows * outputs];
-        if !bias.is_empty() {
-            y.par_chunks_mut(ROWS * outputs).for_each(|chunk| {
-                for row in chunk.chunks_exact_mut(outputs) {
-                    row.copy_from_slice(bias.values());
-                }
-            });
-        }
         let a = Matrix::rows(x.values(), rows, inputs);
         let b = Matrix::rows(weight.values(), outputs, inputs).transposed();
-        gemm_into(&mut y, outputs, a, b, 1.0, !bias.is_empty(), Threads::All);
+        let bias = (!bias.is_empty()).then(|| bias.values());
+        let y = product(a, b, bias, Threads::All);
         (Array::new(y, &[rows, outputs]), Saved::default())
     }
 
@@ -41,15 +34,12 @@ impl Kernel for Linear {
         let rows = dy.values().len() / outputs;
         let d = Matrix::rows(dy.values(), rows, outputs);
         let dx = want_x.then(|| {
-            let mut dx = vec![0.0; rows * inputs];
             let w = Matrix::rows(weight.values(), outputs, inputs);
-            gemm_into(&mut dx, inputs, d, w, 1.0, false, Threads::All);
-            Array::new(dx, &[rows, inputs])
+            Array::new(product(d, w, None, Threads::All), &[rows, inputs])
         });
         let dw = want_weight.then(|| {
-            let mut dw = vec![0.0; outputs * inputs];
             let x = Matrix::rows(x.values(), rows, inputs);
-            gemm_into(&mut dw, inputs, d.transposed(), x, 1.0, false, Threads::All);
+            let dw = product(d.transposed(), x, None, Threads::All);
             Array::new(dw, &[outputs, inputs])
         });
         let db = (want_bias && !bias.is_empty())

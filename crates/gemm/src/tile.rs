@@ -1,0 +1,120 @@
+//! One tile of a product: a few rows by a few registers, all sums in registers over the whole inner length.
+//!
+//! Each sum is one chain of fused multiply-adds in the order of the inner index. So a tile's shape, and with it the processor's
+//! instruction set, does not change a bit of the result.
+
+/// What a tile's sums are put onto.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Onto {
+    Nothing,
+    /// What is in `c`.
+    Product,
+    /// A row of values, one a column.
+    Row(*const f32),
+}
+
+/// One tile: `c = alpha a b` onto something.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Tile {
+    /// Inner length.
+    pub inner: usize,
+    pub a: *const f32,
+    /// From one row of `a` to the next, where that is not 1.
+    pub a_row: usize,
+    /// From one inner index of `a` to the next.
+    pub a_step: usize,
+    pub b: *const f32,
+    /// From one inner index of `b` to the next.
+    pub b_step: usize,
+    pub c: *mut f32,
+    pub c_row: usize,
+    /// Columns of `c` that are written.
+    pub columns: usize,
+    pub alpha: f32,
+    pub onto: Onto,
+    /// What will be needed soon: brought into the second-level cache, 16 values for each inner index.
+    pub soon: *const f32,
+}
+
+/// Computes a tile of a fixed number of rows and registers.
+///
+/// # Safety
+/// The processor has the instructions. `a` and `b` can be read at every row (column) and inner index, `b` as wide as its registers;
+/// `columns` columns of `c` can be written, and nobody else touches them; [`Onto::Row`] has as many values.
+pub(super) type TileFunction = unsafe fn(&Tile);
+
+/// Tiles of so many rows: `[registers - 1][rows of `a` are neighbours]`.
+pub(super) type TileFunctions = [[TileFunction; 2]; 2];
+
+/// The [`TileFunctions`] of `$rows` rows.
+macro_rules! tile_functions {
+    ($tile:ident, $rows:literal) => {
+        [
+            [$tile::<$rows, 1, false>, $tile::<$rows, 1, true>],
+            [$tile::<$rows, 2, false>, $tile::<$rows, 2, true>],
+        ]
+    };
+}
+
+/// Defines `tile<ROWS, REGISTERS, NEIGHBOURS>` with the vector operations of the module it is called in, compiled for `$feature`.
+macro_rules! tile {
+    ($($feature:literal)?) => {
+        /// # Safety
+        /// See [`super::tile::TileFunction`].
+        $(#[target_feature(enable = $feature)])?
+        unsafe fn tile<const ROWS: usize, const REGISTERS: usize, const NEIGHBOURS: bool>(tile: &Tile) {
+            let mut sums = [[zero(); REGISTERS]; ROWS];
+            for row in 0..ROWS {
+                for register in 0..REGISTERS {
+                    prefetch_near(tile.c.wrapping_add(row * tile.c_row + register * LANES));
+                }
+            }
+            let (mut a, mut b, mut soon) = (tile.a, tile.b, tile.soon);
+            for _ in 0..tile.inner {
+                prefetch_far(soon);
+                soon = soon.wrapping_add(16);
+                if NEIGHBOURS {
+                    prefetch_near(a.wrapping_add(16 * tile.a_step));
+                }
+                let mut columns = [zero(); REGISTERS];
+                for (register, columns) in columns.iter_mut().enumerate() {
+                    // SAFETY: `b` is as wide as its registers at every inner index.
+                    *columns = unsafe { load(b.add(register * LANES)) };
+                }
+                for (row, sums) in sums.iter_mut().enumerate() {
+                    let place = if NEIGHBOURS { row } else { row * tile.a_row };
+                    // SAFETY: `a` is there at every row and inner index.
+                    let value = splat(unsafe { *a.add(place) });
+                    for (sum, columns) in sums.iter_mut().zip(columns) {
+                        *sum = multiply_add(value, columns, *sum);
+                    }
+                }
+                a = a.wrapping_add(tile.a_step);
+                b = b.wrapping_add(tile.b_step);
+            }
+            let alpha = splat(tile.alpha);
+            for (row, sums) in sums.into_iter().enumerate() {
+                for (register, sum) in sums.into_iter().enumerate() {
+                    let place = register * LANES;
+                    if place >= tile.columns {
+                        continue;
+                    }
+                    let count = tile.columns - place;
+                    let mut value = multiply(sum, alpha);
+                    // SAFETY: `count` columns of `c` from here on are ours, and a row has as many values.
+                    unsafe {
+                        let c = tile.c.add(row * tile.c_row + place);
+                        match tile.onto {
+                            Onto::Nothing => {}
+                            Onto::Product => value = plus(value, load_part(c, count)),
+                            Onto::Row(values) => value = plus(value, load_part(values.add(place), count)),
+                        }
+                        store_part(c, count, value);
+                    }
+                }
+            }
+        }
+    };
+}
+
+pub(super) use {tile, tile_functions};
