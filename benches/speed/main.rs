@@ -24,6 +24,10 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 use table::Results;
 
+/// As in the program.
+#[global_allocator]
+static MEMORY: reviv::engine::memory::Pool = reviv::engine::memory::Pool;
+
 /// Measures reviv, and PyTorch beside it.
 #[derive(Debug, Parser)]
 #[command(name = "speed")]

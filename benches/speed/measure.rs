@@ -18,17 +18,22 @@ impl Meter {
     pub fn measure(&self, name: &str, mut work: impl FnMut()) {
         reset_peak();
         work();
+        let mut faulted = Vec::new();
         let seconds = (0..self.repeats)
             .map(|_| {
-                let start = Instant::now();
+                let (start, before) = (Instant::now(), faults());
                 work();
-                start.elapsed().as_secs_f64()
+                let seconds = start.elapsed().as_secs_f64();
+                faulted.push(faults().zip(before).map(|(after, before)| after - before));
+                seconds
             })
             .collect();
         say(&Line::Measured(Measured {
             name: name.to_owned(),
             seconds,
             memory_mib: peak(),
+            // The call to warm up is the first.
+            faults: faulted.into_iter().skip(1).flatten().max(),
         }));
     }
 }
@@ -57,4 +62,12 @@ fn peak() -> Option<f64> {
     let line = text.lines().find_map(|line| line.strip_prefix("VmHWM:"))?;
     let kib: f64 = line.split_whitespace().next()?.parse().ok()?;
     Some(kib / 1024.0)
+}
+
+/// Minor page faults of this process so far; `None` where the system does not tell.
+fn faults() -> Option<u64> {
+    let text = std::fs::read_to_string("/proc/self/stat").ok()?;
+    // The name before the last bracket may hold anything; the eighth field after it counts.
+    let (_, fields) = text.rsplit_once(')')?;
+    fields.split_whitespace().nth(7)?.parse().ok()
 }

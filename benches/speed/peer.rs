@@ -30,6 +30,9 @@ pub struct Measured {
     pub seconds: Vec<f64>,
     /// Peak of resident memory while it ran; `None` where the system does not tell.
     pub memory_mib: Option<f64>,
+    /// The most minor page faults of a call after the second; `None` where the side or the system does not tell.
+    #[serde(default)]
+    pub faults: Option<u64>,
 }
 
 /// Who is asked.
@@ -131,6 +134,7 @@ impl Answers {
                 known.seconds.extend(more.seconds);
                 let both = [known.memory_mib, more.memory_mib];
                 known.memory_mib = both.into_iter().flatten().reduce(f64::max);
+                known.faults = known.faults.max(more.faults);
             }
         }
     }

@@ -81,15 +81,25 @@ impl<'a> Cell<'a> {
             _ => "-".to_owned(),
         }
     }
+
+    fn faults(&self) -> String {
+        match self {
+            Self::Measured(Measured {
+                faults: Some(faults),
+                ..
+            }) => faults.to_string(),
+            _ => "-".to_owned(),
+        }
+    }
 }
 
 /// A row per measurement.
 pub fn table(all: &[Results], compared: bool) -> String {
     let mut text = String::new();
     text += if compared {
-        "| case | reviv | PyTorch | ratio | memory, reviv | memory, PyTorch |\n|---|--:|--:|--:|--:|--:|\n"
+        "| case | reviv | PyTorch | ratio | memory, reviv | memory, PyTorch | page faults, reviv |\n|---|--:|--:|--:|--:|--:|--:|\n"
     } else {
-        "| case | reviv | memory |\n|---|--:|--:|\n"
+        "| case | reviv | memory | page faults |\n|---|--:|--:|--:|\n"
     };
     for results in all {
         let case = results.case;
@@ -97,7 +107,7 @@ pub fn table(all: &[Results], compared: bool) -> String {
             let ours = Cell::of(Some(&results.ours), name, case.repeats());
             let _ = write!(text, "| {}: {name} | {} |", case.title(), ours.seconds());
             if !compared {
-                let _ = writeln!(text, " {} |", ours.memory());
+                let _ = writeln!(text, " {} | {} |", ours.memory(), ours.faults());
                 continue;
             }
             let theirs = Cell::of(results.theirs.as_ref(), name, case.repeats());
@@ -107,10 +117,11 @@ pub fn table(all: &[Results], compared: bool) -> String {
             };
             let _ = writeln!(
                 text,
-                " {} | {ratio} | {} | {} |",
+                " {} | {ratio} | {} | {} | {} |",
                 theirs.seconds(),
                 ours.memory(),
-                theirs.memory()
+                theirs.memory(),
+                ours.faults()
             );
         }
     }

@@ -10,11 +10,13 @@
 //! * [`ops`]: linear, layer norm, attention over packed segments, GELU, SwiGLU, cross-entropy, convolution and frame norm of
 //!   video. On the CPU each is one fused operation with a hand-written backward; on other back ends it is unfused of the
 //!   library's own operations. Nearest code is a search on the host; embedding is the library's select everywhere;
-//! * [`gradients`]: gradients by parameter name, their global norm.
+//! * [`gradients`]: gradients by parameter name, their global norm;
+//! * [`memory`]: an allocator that uses the memory of one step again in the next.
 
 pub mod compute;
 pub mod gradients;
 pub mod initialise;
+pub mod memory;
 pub mod ops;
 pub mod parameters;
 pub mod segments;

@@ -1,10 +1,11 @@
 //! GELU and SwiGLU, element by element; backward recomputes from the inputs.
 // Vector instructions reach only what is inlined.
 #![allow(clippy::inline_always)]
+#![allow(unsafe_code)]
 
 use rayon::prelude::*;
 
-use super::{Array, Kernel, Saved, vector};
+use super::{Array, Kernel, Saved, vector, written};
 
 /// Elements per task.
 const ELEMENTS: usize = 8192;
@@ -12,23 +13,26 @@ const ELEMENTS: usize = 8192;
 /// `y[i] = f(i-th values of the inputs)` for all elements, in parallel.
 fn map<const N: usize>(inputs: [&[f32]; N], f: impl Fn([f32; N]) -> f32 + Sync) -> Vec<f32> {
     let length = inputs[0].len();
-    let mut y = vec![0.0; length];
-    y.par_chunks_mut(ELEMENTS)
-        .enumerate()
-        .for_each(|(task, y)| {
-            let inputs = inputs.map(|x| &x[task * ELEMENTS..]);
-            vector::vectorised(
-                #[inline(always)]
-                || {
-                    // An index that has to be checked keeps a loop from becoming vector instructions.
-                    let inputs = inputs.map(|x| &x[..y.len()]);
-                    for (i, y) in y.iter_mut().enumerate() {
-                        *y = f(inputs.map(|x| x[i]));
-                    }
-                },
-            );
-        });
-    y
+    // SAFETY: the tasks are all of `y`, and each writes all of its part.
+    unsafe {
+        written(length, |y| {
+            y.par_chunks_mut(ELEMENTS)
+                .enumerate()
+                .for_each(|(task, y)| {
+                    let inputs = inputs.map(|x| &x[task * ELEMENTS..]);
+                    vector::vectorised(
+                        #[inline(always)]
+                        || {
+                            // An index that has to be checked keeps a loop from becoming vector instructions.
+                            let inputs = inputs.map(|x| &x[..y.len()]);
+                            for (i, y) in y.iter_mut().enumerate() {
+                                y.write(f(inputs.map(|x| x[i])));
+                            }
+                        },
+                    );
+                });
+        })
+    }
 }
 
 /// `x Phi(x)`.
@@ -91,28 +95,38 @@ impl Kernel for SwiGlu {
         _: [bool; 3],
     ) -> [Option<Array>; 3] {
         let length = gate.values().len();
-        let (mut dgate, mut dvalue) = (vec![0.0; length], vec![0.0; length]);
-        dgate
-            .par_chunks_mut(ELEMENTS)
-            .zip(dvalue.par_chunks_mut(ELEMENTS))
-            .zip(gate.values().par_chunks(ELEMENTS))
-            .zip(value.values().par_chunks(ELEMENTS))
-            .zip(dy.values().par_chunks(ELEMENTS))
-            .for_each(|((((dgate, dvalue), gate), value), dy)| {
-                vector::vectorised(
-                    #[inline(always)]
-                    || {
-                        let slopes = dgate.iter_mut().zip(dvalue);
-                        for ((slopes, gate), (value, dy)) in
-                            slopes.zip(gate).zip(value.iter().zip(dy))
-                        {
-                            let s = vector::sigmoid(*gate);
-                            *slopes.0 = dy * value * s * (1.0 + gate * (1.0 - s));
-                            *slopes.1 = dy * gate * s;
-                        }
-                    },
-                );
+        let mut dvalue = Vec::with_capacity(length);
+        // SAFETY: the tasks are all of both gradients, which are as long as what they are of, and each writes all of its parts.
+        let dgate = unsafe {
+            let dgate = written(length, |dgate| {
+                let dvalue = &mut dvalue.spare_capacity_mut()[..length];
+                dgate
+                    .par_chunks_mut(ELEMENTS)
+                    .zip(dvalue.par_chunks_mut(ELEMENTS))
+                    .zip(gate.values().par_chunks(ELEMENTS))
+                    .zip(value.values().par_chunks(ELEMENTS))
+                    .zip(dy.values().par_chunks(ELEMENTS))
+                    .for_each(|((((dgate, dvalue), gate), value), dy)| {
+                        vector::vectorised(
+                            #[inline(always)]
+                            || {
+                                let length = dgate.len();
+                                let dvalue = &mut dvalue[..length];
+                                let (gate, value, dy) =
+                                    (&gate[..length], &value[..length], &dy[..length]);
+                                for i in 0..length {
+                                    let s = vector::sigmoid(gate[i]);
+                                    let slope = dy[i] * value[i] * s;
+                                    dgate[i].write(slope * (1.0 + gate[i] * (1.0 - s)));
+                                    dvalue[i].write(dy[i] * gate[i] * s);
+                                }
+                            },
+                        );
+                    });
             });
+            dvalue.set_len(length);
+            dgate
+        };
         let shape = gate.shape();
         [
             Some(Array::new(dgate, &shape)),

@@ -1,11 +1,13 @@
 //! Layer norm over rows: statistics and output in one pass, all three gradients in one more.
 
+#![allow(unsafe_code)]
+
 use std::sync::Arc;
 
 use rayon::prelude::*;
 
 use super::linear::in_order;
-use super::{Array, Kernel, Saved, vector};
+use super::{Array, Kernel, Saved, vector, written};
 
 /// Rows per task.
 const ROWS: usize = 64;
@@ -31,29 +33,35 @@ impl Kernel for LayerNorm {
         } else {
             bias.values()
         };
-        let mut y = vec![0.0; rows * width];
         let mut statistics = vec![0.0; rows * 2];
-        y.par_chunks_mut(ROWS * width)
-            .zip(statistics.par_chunks_mut(ROWS * 2))
-            .zip(x.values().par_chunks(ROWS * width))
-            .for_each(|((y, statistics), x)| {
-                vector::vectorised(
-                    #[inline(always)]
-                    || {
-                        let (weight, bias) = (&weight[..width], &bias[..width]);
-                        let rows = y.chunks_exact_mut(width).zip(x.chunks_exact(width));
-                        for ((y, x), statistics) in rows.zip(statistics.chunks_exact_mut(2)) {
-                            let mean = vector::sum(x) / width as f32;
-                            let variance = vector::squares_about(x, mean) / width as f32;
-                            let scale = 1.0 / (variance + self.epsilon).sqrt();
-                            statistics.copy_from_slice(&[mean, scale]);
-                            for i in 0..width {
-                                y[i] = (x[i] - mean) * scale * weight[i] + bias[i];
-                            }
-                        }
-                    },
-                );
-            });
+        let values = x.values();
+        // SAFETY: the tasks are all of `y`, and each writes all values of all its rows.
+        let y = unsafe {
+            written(rows * width, |y| {
+                y.par_chunks_mut(ROWS * width)
+                    .zip(statistics.par_chunks_mut(ROWS * 2))
+                    .zip(values.par_chunks(ROWS * width))
+                    .for_each(|((y, statistics), x)| {
+                        vector::vectorised(
+                            #[inline(always)]
+                            || {
+                                let (weight, bias) = (&weight[..width], &bias[..width]);
+                                let rows = y.chunks_exact_mut(width).zip(x.chunks_exact(width));
+                                for ((y, x), statistics) in rows.zip(statistics.chunks_exact_mut(2))
+                                {
+                                    let mean = vector::sum(x) / width as f32;
+                                    let variance = vector::squares_about(x, mean) / width as f32;
+                                    let scale = 1.0 / (variance + self.epsilon).sqrt();
+                                    statistics.copy_from_slice(&[mean, scale]);
+                                    for i in 0..width {
+                                        y[i].write((x[i] - mean) * scale * weight[i] + bias[i]);
+                                    }
+                                }
+                            },
+                        );
+                    });
+            })
+        };
         let saved = Saved {
             numbers: Arc::new(statistics),
             output: None,

@@ -13,6 +13,7 @@ mod frame_norm;
 mod layer_norm;
 mod linear;
 
+use std::mem::MaybeUninit;
 use std::sync::Arc;
 
 use burn::backend::tensor::FloatTensor;
@@ -62,6 +63,19 @@ impl Array {
     fn is_empty(&self) -> bool {
         self.values().is_empty()
     }
+}
+
+/// `length` values that `write` writes, without clearing them first.
+///
+/// # Safety
+/// `write` writes every one.
+#[allow(unsafe_code)]
+unsafe fn written(length: usize, write: impl FnOnce(&mut [MaybeUninit<f32>])) -> Vec<f32> {
+    let mut values = Vec::with_capacity(length);
+    write(&mut values.spare_capacity_mut()[..length]);
+    // SAFETY: all are written, as the caller promises.
+    unsafe { values.set_len(length) };
+    values
 }
 
 /// What a forward pass leaves for backward, besides its inputs.
