@@ -27,6 +27,16 @@ bench *NAME:
 speed *ARGUMENTS:
     cargo bench --bench speed -- {{ ARGUMENTS }}
 
+# Products of every model's shapes: `just products --blas /path/to/libmkl_rt.so`.
+products *ARGUMENTS:
+    cargo bench --bench products -- {{ ARGUMENTS }}
+
+# Remakes benches/results.md: models, training and decoding with page faults beside PyTorch, products beside a CBLAS library, a clean build.
+results PYTHON BLAS:
+    cargo bench --bench speed -- --python {{ PYTHON }} --write benches/results.md
+    cargo bench --bench products -- --blas {{ BLAS }} >> benches/results.md
+    CARGO_TARGET_DIR=target/clean bash -c 'rm -rf target/clean; time -p cargo build --release --quiet' 2>&1 | sed -n 's/^real/\nA clean release build, seconds:/p' >> benches/results.md
+
 # The editor's schema, after a setting has changed.
 schema:
     cargo run --release -- schema

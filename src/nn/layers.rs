@@ -106,7 +106,7 @@ impl Mlp {
     /// With tanh.
     #[must_use]
     pub fn forward_tanh(&self, x: Tensor<2>) -> Tensor<2> {
-        self.fc2.forward(self.fc1.forward(x).tanh())
+        self.fc2.forward(ops::tanh(self.fc1.forward(x)))
     }
 }
 

@@ -219,6 +219,7 @@ impl Op for Predict {
         settings: &PredictSettings,
         context: &mut dyn StageContext,
     ) -> Result<Value, StageError> {
+        let _memory = crate::engine::memory::Stage;
         let model = artifact(context, "model")?;
         let reconstructor = Reconstructor::open(&model.path, &Compute::cpu()).map_err(refused)?;
         let root = artifact(context, "clips")?.path.join(&settings.split);

@@ -229,6 +229,7 @@ impl Op for Reconstruct {
         settings: &ReconstructSettings,
         context: &mut dyn StageContext,
     ) -> Result<Value, StageError> {
+        let _memory = crate::engine::memory::Stage;
         let model = match &settings.model_folder {
             Some(folder) => PathBuf::from(&folder.0),
             None => artifact(context, "model")?.path.clone(),

@@ -209,6 +209,7 @@ impl Op for Tokenize {
         settings: &TokenizeSettings,
         context: &mut dyn StageContext,
     ) -> Result<Value, StageError> {
+        let _memory = crate::engine::memory::Stage;
         let clips = context
             .inputs("clips")
             .first()

@@ -292,6 +292,7 @@ impl Op for TrainMget {
         settings: &TrainMgetSettings,
         context: &mut dyn StageContext,
     ) -> Result<Value, StageError> {
+        let _memory = crate::engine::memory::Stage;
         run::Run::prepare(settings, context)?.train(context)
     }
 }

@@ -320,6 +320,7 @@ impl Op for TrainTokenizer {
         settings: &TrainTokenizerSettings,
         context: &mut dyn StageContext,
     ) -> Result<Value, StageError> {
+        let _memory = crate::engine::memory::Stage;
         run::run(settings, context)
     }
 }

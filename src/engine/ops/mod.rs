@@ -109,6 +109,15 @@ pub fn gelu<const D: usize>(x: Tensor<D>) -> Tensor<D> {
     burn::tensor::activation::gelu(x)
 }
 
+/// The hyperbolic tangent, element by element.
+#[must_use]
+pub fn tanh<const D: usize>(x: Tensor<D>) -> Tensor<D> {
+    if fused::takes(&x) {
+        return fused::run(Fused::Tanh, x, NONE, NONE);
+    }
+    x.tanh()
+}
+
 /// `silu(gate) * value`, element by element.
 #[must_use]
 pub fn swiglu(gate: Tensor<2>, value: Tensor<2>) -> Tensor<2> {

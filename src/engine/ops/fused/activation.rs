@@ -1,4 +1,4 @@
-//! GELU and SwiGLU, element by element; backward recomputes from the inputs.
+//! GELU, SwiGLU and the hyperbolic tangent, element by element; backward recomputes from the inputs, of the last from the output.
 // Vector instructions reach only what is inlined.
 #![allow(clippy::inline_always)]
 #![allow(unsafe_code)]
@@ -68,6 +68,43 @@ impl Kernel for Gelu {
             [x.values(), dy.values()],
             #[inline(always)]
             |[x, dy]| dy * (phi(x) + x * DENSITY * vector::exp(-0.5 * x * x)),
+        );
+        [Some(Array::new(dx, &x.shape())), None, None]
+    }
+}
+
+/// The hyperbolic tangent.
+#[derive(Debug)]
+pub struct Tanh;
+
+impl Kernel for Tanh {
+    /// Saves the output.
+    fn forward(&self, [x, _, _]: [&Array; 3]) -> (Array, Saved) {
+        let y = map(
+            [x.values()],
+            #[inline(always)]
+            |[x]| vector::tanh(x),
+        );
+        let y = Array::new(y, &x.shape());
+        let saved = Saved {
+            output: Some(y.clone()),
+            ..Saved::default()
+        };
+        (y, saved)
+    }
+
+    fn backward(
+        &self,
+        [x, _, _]: [&Array; 3],
+        saved: &Saved,
+        dy: &Array,
+        _: [bool; 3],
+    ) -> [Option<Array>; 3] {
+        let output = saved.output.as_ref().expect("forward saves it");
+        let dx = map(
+            [output.values(), dy.values()],
+            #[inline(always)]
+            |[y, dy]| dy * (1.0 - y * y),
         );
         [Some(Array::new(dx, &x.shape())), None, None]
     }

@@ -105,6 +105,7 @@ pub enum Fused {
     LayerNorm { epsilon: f32 },
     Attention { heads: usize, segments: Segments },
     Gelu,
+    Tanh,
     SwiGlu,
     CrossEntropy { targets: Arc<[u32]> },
     TiedCrossEntropy { targets: Arc<[u32]> },
@@ -122,6 +123,7 @@ impl Fused {
                 segments,
             }),
             Self::Gelu => run(&activation::Gelu),
+            Self::Tanh => run(&activation::Tanh),
             Self::SwiGlu => run(&activation::SwiGlu),
             Self::CrossEntropy { targets } => run(&cross_entropy::CrossEntropy { targets }),
             Self::TiedCrossEntropy { targets } => run(&cross_entropy::TiedCrossEntropy { targets }),
@@ -461,6 +463,12 @@ mod tests {
                 vec![wave([130, 70], 0.0) * 3.0],
                 |x| ops::gelu(x[0].clone()),
                 |x| burn::tensor::activation::gelu(x[0].clone()),
+            ),
+            (
+                "tanh",
+                vec![wave([130, 70], 0.0) * 3.0],
+                |x| ops::tanh(x[0].clone()),
+                |x| x[0].clone().tanh(),
             ),
             (
                 "swiglu",
