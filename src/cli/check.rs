@@ -4,6 +4,7 @@ use super::request::{Changes, count, summary};
 use super::terminal::{Failure, Terminal};
 use crate::experiment::catalog::Catalog;
 use crate::experiment::load;
+use crate::formats::text::of_path;
 use serde_json::json;
 use std::path::PathBuf;
 
@@ -30,7 +31,7 @@ impl super::Run for Check {
             failed |= report.failed();
             if self.json {
                 records.push(json!({
-                    "file": file,
+                    "file": of_path(file),
                     "ok": !report.failed(),
                     "diagnostics": report.records(),
                 }));

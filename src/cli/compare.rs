@@ -28,7 +28,7 @@ use std::path::{Path, PathBuf};
 pub struct Compare {
     /// Run names, run directories, or scores files
     #[arg(value_name = "RUN", required_unless_present = "trajectory")]
-    runs: Vec<String>,
+    runs: Vec<PathBuf>,
     /// The row that all others are tested against
     #[arg(long, value_name = "ROW")]
     baseline: Option<String>,
@@ -77,7 +77,7 @@ impl super::Run for Compare {
             let mut found = entrants_of(name, &self.place, &settings.columns)?;
             for entrant in &mut found {
                 if entrants.iter().any(|e| e.label == entrant.label) {
-                    entrant.label = format!("{name}/{}", entrant.label);
+                    entrant.label = format!("{}/{}", name.display(), entrant.label);
                 }
             }
             entrants.extend(found);
@@ -209,8 +209,11 @@ fn numbers(errors: &TrajectoryErrors) -> serde_json::Value {
 ///
 /// Stages of a run that score nothing of `columns` are left out, if another of its stages does: a table of depth has no row
 /// for scores of hands, which may be of other clips.
-pub fn entrants_of(name: &str, runs: &Path, columns: &[String]) -> Result<Vec<Method>, Failure> {
-    let path = Path::new(name);
+pub fn entrants_of(
+    path: &Path,
+    runs: &Path,
+    columns: &[String],
+) -> Result<Vec<Method>, Failure> {
     let read = |path: &Path| {
         Scores::read(path)
             .map_err(|error| Failure::input(error.to_string(), "was it written by `op: evaluate`?"))
@@ -223,7 +226,7 @@ pub fn entrants_of(name: &str, runs: &Path, columns: &[String]) -> Result<Vec<Me
         }]);
     }
     let run =
-        RunDirectory::named(runs, name).map_err(|error| Failure::input(error.to_string(), ""))?;
+        RunDirectory::named(runs, path).map_err(|error| Failure::input(error.to_string(), ""))?;
     let schedule: Schedule = read_json(&run.path().join("plan.json"))
         .map_err(|error| Failure::input(error.to_string(), ""))?;
     let cache = cache_of(run.runs());

@@ -15,6 +15,7 @@ use crate::datasets::{ClipSource, ReadError};
 use crate::experiment::catalog::Catalog;
 use crate::experiment::load;
 use crate::experiment::registry::Registry;
+use crate::formats::text::of_path;
 use crate::ops::clips::SourceSettings;
 use serde::Deserialize as _;
 use std::ops::ControlFlow;
@@ -202,7 +203,7 @@ fn say(terminal: &Terminal, converted: &Converted, output: &Path, as_json: bool)
     let tally = &converted.tally;
     if as_json {
         terminal.json(&serde_json::json!({
-            "folder": output, "shards": converted.shards, "reused": converted.reused,
+            "folder": of_path(output), "shards": converted.shards, "reused": converted.reused,
             "clips": tally.clips, "dropped": tally.dropped, "damaged": tally.damaged,
         }));
         return;

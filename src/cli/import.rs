@@ -1,6 +1,7 @@
 //! `reviv import`: released weights of others into our safetensors; and what `reviv show FILE` says of a checkpoint.
 
 use super::terminal::{Failure, Terminal};
+use crate::formats::text::of_path;
 use crate::import::cosmos::parse_compression;
 use crate::import::{Checkpoint, ImportError, ImportOptions, import};
 use serde_json::json;
@@ -73,7 +74,7 @@ impl super::Run for Import {
                     })
                 })
                 .collect();
-            terminal.json(&json!({ "folder": report.folder, "parts": parts }));
+            terminal.json(&json!({ "folder": of_path(&report.folder), "parts": parts }));
             return Ok(());
         }
         for part in &report.parts {
@@ -112,7 +113,7 @@ pub(super) fn show(path: &Path, as_json: bool, terminal: &Terminal) -> Result<()
             })
             .collect();
         terminal.json(&json!({
-            "file": path, "format": format!("{:?}", checkpoint.format()), "entries": entries,
+            "file": of_path(path), "format": format!("{:?}", checkpoint.format()), "entries": entries,
             "arguments": checkpoint.arguments(), "others": checkpoint.others(),
         }));
         return Ok(());

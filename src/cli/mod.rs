@@ -94,21 +94,9 @@ fn grammar() -> clap::Command {
 ///
 /// Exit codes: 0 done, 1 the user's input, 2 the machine or a bug, 130 stopped by Ctrl-C (the run continues when asked again).
 pub fn main() -> ExitCode {
-    let arguments = match Arguments::try_parse() {
-        Ok(arguments) => arguments,
-        Err(error) => {
-            // A closed pipe is no reason to complain.
-            let _ = error.print();
-            return if error.use_stderr() {
-                ExitCode::from(1)
-            } else {
-                ExitCode::SUCCESS
-            };
-        }
-    };
     let terminal = Terminal::new();
-    match arguments.command.run(&terminal) {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(failure) => terminal.fail(failure),
+    match Arguments::try_parse() {
+        Ok(arguments) => terminal.end(arguments.command.run(&terminal)),
+        Err(error) => terminal.usage(&error),
     }
 }

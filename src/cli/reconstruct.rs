@@ -150,7 +150,7 @@ impl Reconstruct {
         let runs = &self.place.runs;
         if let Some(given) = &self.model {
             if given.join("run.json").is_file() || !given.exists() {
-                let run = RunDirectory::named(runs, &given.to_string_lossy())
+                let run = RunDirectory::named(runs, given)
                     .map_err(|error| tell(terminal, &error))?;
                 return model_of(&run).ok_or_else(|| {
                     Failure::input(
@@ -217,7 +217,16 @@ fn change(key: &str, value: &str) -> String {
 /// A path as a YAML string that does not depend on where the experiment lies.
 fn text(path: &Path) -> Result<String, Failure> {
     let absolute = std::path::absolute(path).map_err(Failure::machine)?;
-    Ok(serde_json::Value::from(absolute.to_string_lossy()).to_string())
+    let Some(text) = absolute.to_str() else {
+        return Err(Failure::input(
+            format!(
+                "`{}`: a name that is not UTF-8 cannot stand in an experiment",
+                absolute.display()
+            ),
+            "rename it, or give a link to it",
+        ));
+    };
+    Ok(serde_json::Value::from(text).to_string())
 }
 
 /// The model that a run trained, or used: the last one of its plan that is in the cache.

@@ -129,7 +129,7 @@ pub fn progress(terminal: &Terminal) -> Progress {
 pub fn find(
     terminal: &Terminal,
     runs: &Path,
-    name: &str,
+    name: impl AsRef<Path>,
 ) -> Result<crate::run::RunDirectory, Failure> {
     crate::run::RunDirectory::named(runs, name).map_err(|error| tell(terminal, &error))
 }

@@ -16,7 +16,7 @@ use std::path::{Path, PathBuf};
 pub struct Show {
     /// An op, an entry (`uniform`, or `masking/uniform`), a run, or a checkpoint file
     #[arg(value_name = "RUN|ENTRY|OP|FILE")]
-    name: String,
+    name: PathBuf,
     /// Where runs are
     #[arg(long, default_value = "runs", value_name = "DIR")]
     runs: PathBuf,
@@ -27,16 +27,16 @@ pub struct Show {
 
 impl super::Run for Show {
     fn run(self, terminal: &Terminal) -> Result<(), Failure> {
-        let path = Path::new(&self.name);
-        if path.is_file() {
-            return super::import::show(path, self.json, terminal);
+        if self.name.is_file() {
+            return super::import::show(&self.name, self.json, terminal);
         }
+        let name = self.name.to_string_lossy();
         let catalog = Catalog::linked();
         let registry = Registry::new(&catalog, beside(Path::new("./x"), "registry").as_deref());
         let mut found = false;
         let mut values = Vec::new();
         let mut text = String::new();
-        if let Some(op) = catalog.op(&self.name) {
+        if let Some(op) = catalog.op(&name) {
             found = true;
             let settings = catalog
                 .schema(op.name())
@@ -67,7 +67,7 @@ impl super::Run for Show {
             }));
         }
         for entry in registry.list(None) {
-            if entry.name != self.name && format!("{}/{}", entry.kind, entry.name) != self.name {
+            if entry.name != name && format!("{}/{}", entry.kind, entry.name) != name {
                 continue;
             }
             if found {
@@ -136,7 +136,7 @@ impl super::Run for Show {
         if !found && fitting.len() > 1 {
             let names: Vec<String> = fitting.iter().map(RunDirectory::name).collect();
             return Err(Failure::input(
-                format!("{} runs fit `{}`", names.len(), self.name),
+                format!("{} runs fit `{name}`", names.len()),
                 format!("they are {}", names.join(", ")),
             ));
         }
@@ -145,8 +145,8 @@ impl super::Run for Show {
             let mut known: Vec<&str> = all.iter().map(|entry| entry.name.as_str()).collect();
             known.extend(catalog.ops().iter().map(|op| op.name()));
             return Err(Failure::input(
-                format!("there is no op, registry entry or run `{}`", self.name),
-                crate::experiment::nearest(&self.name, known.into_iter()).map_or_else(
+                format!("there is no op, registry entry, run or file `{name}`"),
+                crate::experiment::nearest(&name, known.into_iter()).map_or_else(
                     || "`reviv list` shows what there is".to_owned(),
                     |near| format!("did you mean `{near}`?"),
                 ),

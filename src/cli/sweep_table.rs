@@ -18,11 +18,7 @@ pub fn write(
     asked: &Compare,
     run: &RunDirectory,
 ) -> Result<String, Failure> {
-    let entrants = entrants_of(
-        &run.path().display().to_string(),
-        run.runs(),
-        &asked.columns,
-    )?;
+    let entrants = entrants_of(run.path(), run.runs(), &asked.columns)?;
     let against = asked.against.as_ref();
     let published = against.and_then(|name| published(catalog, &experiment.path, name));
     let over = asked.interval.over.iter().map(|what| match what {

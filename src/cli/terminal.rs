@@ -3,6 +3,7 @@
 use std::fmt::Display;
 use std::io::IsTerminal as _;
 use std::process::ExitCode;
+use std::sync::OnceLock;
 
 /// Why a command failed.
 #[derive(Debug)]
@@ -39,6 +40,8 @@ pub struct Terminal {
     pub colour: bool,
     /// Whether stderr is looked at by a person.
     pub interactive: bool,
+    /// Why data did not reach stdout, once.
+    lost: OnceLock<String>,
 }
 
 impl Terminal {
@@ -50,24 +53,60 @@ impl Terminal {
         Self {
             colour: interactive && !refused,
             interactive,
+            lost: OnceLock::new(),
         }
     }
 
-    /// Writes data to stdout. A reader that has seen enough ends the process quietly.
+    /// Writes data to stdout. A reader that has seen enough ends the process quietly; any other failure is remembered, and
+    /// [`Terminal::end`] says it.
     pub fn data(&self, text: impl Display) {
-        let written = write_to(&mut std::io::stdout().lock(), &text);
-        if let Err(error) = written
-            && error.kind() == std::io::ErrorKind::BrokenPipe
-        {
-            std::process::exit(0);
+        if let Err(error) = write_to(&mut std::io::stdout().lock(), &text) {
+            if error.kind() == std::io::ErrorKind::BrokenPipe {
+                std::process::exit(0);
+            }
+            self.lose(format!("stdout: {error}"));
         }
+    }
+
+    /// Remembers the first reason why data was lost.
+    fn lose(&self, reason: String) {
+        self.lost.get_or_init(|| reason);
     }
 
     /// Writes JSON to stdout.
     pub fn json(&self, value: &impl serde::Serialize) {
         match serde_json::to_string_pretty(value) {
             Ok(text) => self.data(format_args!("{text}\n")),
-            Err(error) => self.note(format_args!("error: {error}\n")),
+            Err(error) => self.lose(error.to_string()),
+        }
+    }
+
+    /// Prints what the command line itself has to say: help and version to stdout, mistakes to stderr.
+    pub fn usage(&self, error: &clap::Error) -> ExitCode {
+        match error.print() {
+            Err(failed) if !error.use_stderr() && failed.kind() != std::io::ErrorKind::BrokenPipe => {
+                self.lose(format!("stdout: {failed}"));
+            }
+            // A closed pipe is no reason to complain.
+            _ => {}
+        }
+        self.end(if error.use_stderr() {
+            Err(Failure::Reported)
+        } else {
+            Ok(())
+        })
+    }
+
+    /// The end of the process: says why the command failed, and that what it printed did not arrive.
+    pub fn end(&self, result: Result<(), Failure>) -> ExitCode {
+        let lost = self.lost.get().cloned().map(Failure::Machine);
+        match (result, lost) {
+            (Ok(()), None) => ExitCode::SUCCESS,
+            (Ok(()), Some(failure)) | (Err(failure), None) => self.fail(failure),
+            (Err(failure), Some(lost)) => {
+                self.fail(lost);
+                self.fail(failure)
+            }
         }
     }
 
@@ -78,7 +117,7 @@ impl Terminal {
     }
 
     /// Says why the command failed; gives the exit code.
-    pub fn fail(&self, failure: Failure) -> ExitCode {
+    fn fail(&self, failure: Failure) -> ExitCode {
         match failure {
             Failure::Reported => ExitCode::from(1),
             Failure::Ended(code) => ExitCode::from(code),

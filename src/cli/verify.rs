@@ -3,13 +3,14 @@
 use super::run::{RunsDir, find, interruptible, progress, tell};
 use super::terminal::{Failure, Terminal};
 use crate::run::verify::{Redo, Verdict, verify};
+use std::path::PathBuf;
 
 /// Re-hash a run's inputs and artifacts, redo its work from a checkpoint, and demand identical bytes
 #[derive(Debug, clap::Args)]
 pub struct Verify {
     /// A run: its path, its name, or enough of it
     #[arg(value_name = "RUN")]
-    run: String,
+    run: PathBuf,
     /// Only hash, redo nothing
     #[arg(long, conflicts_with = "all")]
     hash_only: bool,

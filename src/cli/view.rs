@@ -49,7 +49,7 @@ impl View {
         if own.is_file() {
             return Ok(vec![own]);
         }
-        let run = find(terminal, &self.place.runs, &self.run.to_string_lossy())?;
+        let run = find(terminal, &self.place.runs, &self.run)?;
         let schedule: Schedule = files::read_json(&run.path().join("plan.json"))
             .map_err(|error| tell(terminal, &error))?;
         let cache = cache_of(run.runs());

@@ -14,6 +14,7 @@ use super::recording::{
 };
 use super::track::{Joints, SECOND, Track};
 use crate::formats::read_error::Position;
+use crate::formats::text::read_json;
 use crate::video::image::{Image, Turn};
 use nalgebra::Point3;
 use ndarray::Array2;
@@ -196,14 +197,7 @@ fn skeleton_of(folder: &Path, serial: Option<&str>) -> Result<Option<PathBuf>, R
     if !path.is_file() {
         return Ok(None);
     }
-    let text = std::fs::read_to_string(&path).map_err(|cause| ReadError::io(&path, cause))?;
-    let association: Association = serde_json::from_str(&text).map_err(|error| {
-        ReadError::malformed(
-            &path,
-            Position::Line(error.line() as u64),
-            error.to_string(),
-        )
-    })?;
+    let association: Association = read_json(&path)?;
     let mine = association
         .skeletons
         .iter()

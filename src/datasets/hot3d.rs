@@ -17,6 +17,7 @@ use super::recording::{ColourFrames, CutSettings, MountedCamera, Recording};
 use super::track::{ClockMap, SECOND, Track};
 use super::umetrack::{self, HandProfile};
 use crate::formats::read_error::Position;
+use crate::formats::text::read_json;
 use crate::geometry::camera::{Camera, Fisheye624, Lens};
 use crate::video::image::{Image, Turn};
 use nalgebra::{Isometry3, Translation3, Vector3};
@@ -56,15 +57,7 @@ struct Metadata {
 }
 
 fn metadata(folder: &Path) -> Result<Metadata, ReadError> {
-    let path = folder.join("metadata.json");
-    let text = std::fs::read_to_string(&path).map_err(|cause| ReadError::io(&path, cause))?;
-    serde_json::from_str(&text).map_err(|error| {
-        ReadError::malformed(
-            &path,
-            Position::Line(error.line() as u64),
-            error.to_string(),
-        )
-    })
+    read_json(&folder.join("metadata.json"))
 }
 
 /// `Aria` or `Quest3`, for a folder that is a recording.
@@ -294,10 +287,7 @@ struct QuestPose {
 }
 
 fn quest_camera(path: &Path, stream: &str) -> Result<MountedCamera, ReadError> {
-    let text = std::fs::read_to_string(path).map_err(|cause| ReadError::io(path, cause))?;
-    let cameras: Vec<QuestCamera> = serde_json::from_str(&text).map_err(|error| {
-        ReadError::malformed(path, Position::Line(error.line() as u64), error.to_string())
-    })?;
+    let cameras: Vec<QuestCamera> = read_json(path)?;
     let camera = cameras
         .iter()
         .find(|camera| camera.stream == stream)

@@ -20,6 +20,7 @@ use super::open::Frames;
 use super::recording::{CutSettings, GazeSample, JointFrame, MountedCamera, Recording};
 use super::track::SECOND;
 use crate::formats::read_error::Position;
+use crate::formats::text;
 use crate::video::image::Turn;
 use crate::video::{Video, VideoSettings};
 use nalgebra::{Isometry3, Unit, Vector3};
@@ -54,8 +55,8 @@ pub fn is_recording(folder: &Path) -> bool {
 
 fn manifest(folder: &Path) -> Result<Manifest, ReadError> {
     let path = folder.join(FILE);
-    let text = std::fs::read_to_string(&path).map_err(|cause| ReadError::io(&path, cause))?;
-    let manifest: Manifest = serde_saphyr::from_str(&text).map_err(|error| {
+    let text = text::read(&path)?;
+    let manifest: Manifest = serde_saphyr::from_str(&text::yaml(&text)).map_err(|error| {
         let place = error
             .location()
             .map_or(Position::File, |at| Position::Line(at.line()));

@@ -5,9 +5,9 @@
 use super::ReadError;
 use super::aria::calibration::unit_quaternion;
 use super::aria::hand_tracking::from_landmarks;
-use super::csv::Lines;
 use super::track::{Joints, SECOND, Track};
 use crate::formats::read_error::Position;
+use crate::formats::text::{Lines, json_line, read_json};
 use nalgebra::{Matrix4, Point3, Rotation3, Unit, Vector3, Vector4};
 use serde::Deserialize;
 use std::path::Path;
@@ -53,10 +53,7 @@ impl HandProfile {
     /// # Errors
     /// When the file is damaged or holds another model.
     pub fn read(path: &Path) -> Result<Self, ReadError> {
-        let text = std::fs::read_to_string(path).map_err(|cause| ReadError::io(path, cause))?;
-        let file: ProfileFile = serde_json::from_str(&text).map_err(|error| {
-            ReadError::malformed(path, Position::Line(error.line() as u64), error.to_string())
-        })?;
+        let file: ProfileFile = read_json(path)?;
         Self::from_model(&file.hand_model).map_err(|reason| {
             ReadError::malformed(path, Position::File, format!("hand_model: {reason}"))
         })
@@ -184,11 +181,11 @@ pub fn read(path: &Path, profile: &HandProfile) -> Result<[Track<Joints>; 2], Re
     let mut samples = [Vec::new(), Vec::new()];
     for line in Lines::open(path)? {
         let (number, text) = line?;
-        if text.trim().is_empty() {
+        let Some(text) = json_line(&text) else {
             continue;
-        }
+        };
         let fail = |reason: String| ReadError::malformed(path, Position::Line(number), reason);
-        let line: Line = serde_json::from_str(&text).map_err(|error| fail(error.to_string()))?;
+        let line: Line = serde_json::from_str(text).map_err(|error| fail(error.to_string()))?;
         let poses = [line.hand_poses.left, line.hand_poses.right];
         for (side, pose) in poses.into_iter().enumerate() {
             let Some(pose) = pose else { continue };

@@ -2,6 +2,8 @@
 
 use super::outcome::MetricError;
 use super::trajectory::{Pose, TrajectoryErrors, trajectory_errors};
+use crate::formats::ReadError;
+use crate::formats::text::{Lines, is_space, trim};
 use crate::geometry::alignment::Freedom;
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 use std::path::Path;
@@ -16,16 +18,12 @@ pub struct TimedPoses {
 /// Why a trajectory file cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum TumError {
-    #[error("{path}: {error}")]
-    Io {
-        path: String,
-        #[source]
-        error: std::io::Error,
-    },
+    #[error(transparent)]
+    Read(#[from] ReadError),
     #[error("{path}:{line}: {reason}")]
     Line {
         path: String,
-        line: usize,
+        line: u64,
         reason: String,
     },
     #[error("{path}: no poses: a TUM trajectory has lines `timestamp tx ty tz qx qy qz qw`")]
@@ -44,25 +42,22 @@ pub enum TumError {
 /// When the file cannot be read, a line does not hold eight finite numbers, a quaternion has length zero, or time goes back.
 pub fn read_tum(path: &Path) -> Result<TimedPoses, TumError> {
     let name = || path.display().to_string();
-    let text = std::fs::read_to_string(path).map_err(|error| TumError::Io {
-        path: name(),
-        error,
-    })?;
     let mut trajectory = TimedPoses::default();
-    for (index, line) in text.lines().enumerate() {
-        let line = line.trim();
+    for line in Lines::open(path)? {
+        let (number, line) = line?;
+        let line = trim(&line);
         if line.is_empty() || line.starts_with('#') {
             continue;
         }
         let (time, pose) = parse_line(line).map_err(|reason| TumError::Line {
             path: name(),
-            line: index + 1,
+            line: number,
             reason,
         })?;
         if trajectory.times.last().is_some_and(|&last| time < last) {
             return Err(TumError::Line {
                 path: name(),
-                line: index + 1,
+                line: number,
                 reason: format!("time goes back to {time}"),
             });
         }
@@ -76,7 +71,7 @@ pub fn read_tum(path: &Path) -> Result<TimedPoses, TumError> {
 }
 
 fn parse_line(line: &str) -> Result<(f64, Pose), String> {
-    let separators = |c: char| c.is_whitespace() || c == ',';
+    let separators = |c: char| is_space(c) || matches!(c, ',' | ';');
     let numbers: Vec<f64> = line
         .split(separators)
         .filter(|word| !word.is_empty())
@@ -85,6 +80,12 @@ fn parse_line(line: &str) -> Result<(f64, Pose), String> {
             _ => Err(format!("`{word}` is not a finite number")),
         })
         .collect::<Result<_, _>>()?;
+    if numbers.len() == 12 {
+        return Err(
+            "12 numbers, as KITTI writes poses, without times: write `timestamp tx ty tz qx qy qz qw`"
+                .to_owned(),
+        );
+    }
     let &[time, x, y, z, qx, qy, qz, qw] = numbers.as_slice() else {
         return Err(format!(
             "{} numbers, expected 8: timestamp tx ty tz qx qy qz qw",
@@ -173,11 +174,34 @@ mod tests {
     }
 
     #[test]
+    fn a_trajectory_is_the_same_however_an_editor_saved_it() {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        let read = |text: &str| {
+            std::fs::write(file.path(), text).unwrap();
+            read_tum(file.path()).unwrap()
+        };
+        let plain = read("1 0 0 0 0 0 0 1\n2 1 2 3 0 0 0 1\n");
+        for text in [
+            "\u{feff}1 0 0 0 0 0 0 1\r\n2 1 2 3 0 0 0 1\r\n",
+            "\u{feff}# a comment\r1 0 0 0 0 0 0 1\r2 1 2 3 0 0 0 1",
+            "1\u{a0}0\u{2007}0 0 0 0 0 1\u{a0}\n\u{a0}\n2 1 2 3 0 0 0 1\u{feff}\n",
+            "1,0,0,0,0,0,0,1,\n2, 1, 2, 3, 0, 0, 0, 1,\n",
+            "1\t0\t0\t0\t0\t0\t0\t1\n2;1;2;3;0;0;0;1\n",
+        ] {
+            assert_eq!(read(text), plain, "{text:?}");
+        }
+        std::fs::write(file.path(), b"\xff\xfe1\0 \0").unwrap();
+        let error = read_tum(file.path()).unwrap_err().to_string();
+        assert!(error.contains("UTF-16"), "{error}");
+    }
+
+    #[test]
     fn a_bad_line_is_named() {
         let file = tempfile::NamedTempFile::new().unwrap();
         for (text, reason) in [
             ("# only a comment\n", "no poses"),
             ("0 0 0 0 0 0 0 1\n1 2 3\n", ":2: 3 numbers"),
+            ("1 0 0 0 0 1 0 0 0 0 1 0\n", ":1: 12 numbers, as KITTI"),
             ("0 0 0 0 0 0 0 0\n", ":1: the quaternion"),
             ("0 0 nan 0 0 0 0 1\n", "`nan` is not a finite number"),
             ("2 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", ":2: time goes back"),

@@ -10,6 +10,7 @@ pub mod npz;
 pub mod pickle;
 pub mod png;
 pub mod read_error;
+pub mod text;
 pub mod zip;
 
 pub use read_error::ReadError;
@@ -35,6 +36,12 @@ pub enum FormatError {
     Missing { name: String, present: String },
     #[error("{0}")]
     Io(#[from] std::io::Error),
+    /// A file was expected.
+    #[error("{kind}, and no regular file")]
+    NotAFile { kind: &'static str },
+    /// More bytes than are held in memory.
+    #[error("more than {limit} bytes")]
+    TooLarge { limit: u64 },
     /// Any of the above, with the file it happened in.
     #[error("{}: {source}", path.display())]
     File {
@@ -62,6 +69,36 @@ impl FormatError {
             },
         }
     }
+}
+
+/// All bytes of a file that is held in memory: of a regular file, never of a pipe or of a device, which may have no end.
+///
+/// # Errors
+/// When it cannot be read, is no regular file, or has more than `limit` bytes.
+pub(crate) fn read_whole(path: &Path, limit: u64) -> Result<Vec<u8>, FormatError> {
+    use std::io::Read;
+    let read = || {
+        // Before it is opened: that of a pipe would wait for somebody who writes.
+        let facts = std::fs::metadata(path)?;
+        if !facts.is_file() {
+            let kind = if facts.is_dir() { "a folder" } else { "a pipe or a device" };
+            return Err(FormatError::NotAFile { kind });
+        }
+        let too_large = || FormatError::TooLarge { limit };
+        if facts.len() > limit {
+            return Err(too_large());
+        }
+        let mut bytes = Vec::new();
+        // It may grow while it is read, and files of `/proc` say that they are empty.
+        std::fs::File::open(path)?
+            .take(limit + 1)
+            .read_to_end(&mut bytes)?;
+        if bytes.len() as u64 > limit {
+            return Err(too_large());
+        }
+        Ok(bytes)
+    };
+    read().map_err(|error: FormatError| error.in_file(path))
 }
 
 /// A temporary file in `folder` that will be renamed, with the rights that a file made in place would have: the process's umask

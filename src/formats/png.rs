@@ -15,11 +15,12 @@ pub enum Picture {
 
 /// More pixels than any camera of the supported data sets has, and few enough to hold.
 const MAX_PIXELS: u64 = 64 << 20;
+/// More than a picture of that many pixels has, uncompressed.
+const MAX_BYTES: u64 = 1 << 30;
 
 /// Reads the picture at `path`. Palettes and fewer than 8 bits are expanded, transparency is dropped.
 pub fn read(path: &Path) -> Result<Picture, FormatError> {
-    std::fs::read(path)
-        .map_err(FormatError::from)
+    super::read_whole(path, MAX_BYTES)
         .and_then(|bytes| parse(&bytes))
         .map_err(|e| e.in_file(path))
 }

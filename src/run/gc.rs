@@ -15,6 +15,7 @@ use std::path::{Path, PathBuf};
 /// What was pruned, or would be.
 #[derive(Debug, Default, Serialize)]
 pub struct Pruned {
+    #[serde(serialize_with = "crate::formats::text::serialize_paths")]
     pub paths: Vec<PathBuf>,
     pub bytes: u64,
     /// Artifacts that runs refer to.

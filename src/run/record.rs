@@ -137,14 +137,15 @@ impl RunDirectory {
     }
 
     /// A run by its path, its name below `runs`, or the beginning or end of that name where only one fits.
-    pub fn named(runs: &Path, name: &str) -> Result<Self, RunError> {
+    pub fn named(runs: &Path, name: impl AsRef<Path>) -> Result<Self, RunError> {
+        let name = name.as_ref();
         let found = Self::fitting(runs, name)?;
         match found.as_slice() {
             [only] => Ok(only.clone()),
             _ => Err(RunError::Request {
                 message: match found.len() {
-                    0 => format!("no run `{name}` in `{}`", runs.display()),
-                    n => format!("{n} runs fit `{name}`"),
+                    0 => format!("no run `{}` in `{}`", name.display(), runs.display()),
+                    n => format!("{n} runs fit `{}`", name.display()),
                 },
                 help: "`reviv list runs` shows all of them".into(),
             }),
@@ -152,8 +153,9 @@ impl RunDirectory {
     }
 
     /// The runs that [`RunDirectory::named`] chooses from.
-    pub fn fitting(runs: &Path, name: &str) -> Result<Vec<Self>, RunError> {
-        if name.is_empty() {
+    pub fn fitting(runs: &Path, name: impl AsRef<Path>) -> Result<Vec<Self>, RunError> {
+        let name = name.as_ref();
+        if name.as_os_str().is_empty() {
             return Ok(Vec::new());
         }
         for path in [PathBuf::from(name), runs.join(name)] {
@@ -162,7 +164,11 @@ impl RunDirectory {
             }
         }
         let mut all = Self::all(runs)?;
-        all.retain(|run| run.name().starts_with(name) || run.name().ends_with(name));
+        let name = name.as_os_str().as_encoded_bytes();
+        all.retain(|run| {
+            let whole = run.path.file_name().unwrap_or_default().as_encoded_bytes();
+            whole.starts_with(name) || whole.ends_with(name)
+        });
         Ok(all)
     }
 

@@ -77,6 +77,7 @@ pub struct PortPlan {
 pub struct FilePlan {
     /// The settings key that names it; `data:NAME` for a data set.
     pub key: String,
+    #[serde(serialize_with = "crate::formats::text::serialize_path")]
     pub path: PathBuf,
     pub blake3: String,
     pub bytes: u64,

@@ -3,6 +3,7 @@
 use super::super::terminal::{Failure, Terminal};
 use super::{Cut, absolute, write};
 use crate::datasets::convert::ConvertSettings;
+use crate::formats::text::of_path;
 use serde_json::json;
 use std::path::PathBuf;
 
@@ -37,7 +38,7 @@ impl Convert {
             skip_damaged: self.skip_damaged,
         };
         let request = json!({
-            "recordings": absolute(&self.path), "clips": source.len(), "cut": cut, "shards": settings,
+            "recordings": of_path(&absolute(&self.path)), "clips": source.len(), "cut": cut, "shards": settings,
         });
         write(
             terminal,

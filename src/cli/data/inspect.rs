@@ -6,6 +6,7 @@ use super::{Cut, failure, remarks, source_entry};
 use crate::datasets::ClipSource;
 use crate::datasets::survey::{Survey, survey};
 use crate::formats::png;
+use crate::formats::text::of_path;
 use crate::modality::inventory::Row;
 use crate::view::contact::contact_sheet;
 use crate::view::paths::paths;
@@ -72,6 +73,7 @@ impl Inspect {
         });
         let files = pictures(&found, &output)?;
         if self.json {
+            let files: Vec<String> = files.iter().map(|file| of_path(file)).collect();
             terminal.json(&json!({ "survey": found, "pictures": files }));
         } else {
             terminal.data(words(&found, source.as_ref()));

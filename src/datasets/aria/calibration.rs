@@ -1,8 +1,8 @@
 //! Aria's calibration JSON: factory calibration in VRS files, one line a moment in `online_calibration.jsonl`.
 
-use crate::datasets::csv::Lines;
 use crate::formats::ReadError;
 use crate::formats::read_error::Position;
+use crate::formats::text::{Lines, json_line};
 use crate::geometry::camera::{Camera, Fisheye624, Lens};
 use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion};
 use serde::Deserialize;
@@ -146,12 +146,12 @@ pub fn online(path: &Path, side: u32) -> Result<Vec<(i64, DeviceCamera)>, ReadEr
     let mut cameras = Vec::new();
     for line in Lines::open(path)? {
         let (number, text) = line?;
-        if text.trim().is_empty() {
+        let Some(text) = json_line(&text) else {
             continue;
-        }
+        };
         let fail = |reason: String| ReadError::malformed(path, Position::Line(number), reason);
         let calibration: Calibration =
-            serde_json::from_str(&text).map_err(|error| fail(error.to_string()))?;
+            serde_json::from_str(text).map_err(|error| fail(error.to_string()))?;
         let time = calibration
             .tracking_timestamp_us
             .and_then(|us| us.checked_mul(1000))

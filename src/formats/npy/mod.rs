@@ -26,10 +26,12 @@ pub struct NpyArray {
     pub data: NpyData,
 }
 
-/// Reads the array in the file at `path`.
+/// More than any recording's array has, and less than a machine has memory.
+const MAX_BYTES: u64 = 16 << 30;
+
+/// Reads the array in the file at `path`: a regular file of at most 16 GB.
 pub fn read(path: &Path) -> Result<NpyArray, FormatError> {
-    std::fs::read(path)
-        .map_err(FormatError::from)
+    super::read_whole(path, MAX_BYTES)
         .and_then(|bytes| parse(&bytes))
         .map_err(|e| e.in_file(path))
 }
