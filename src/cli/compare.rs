@@ -284,7 +284,7 @@ pub fn entrants_of(
     if entrants.is_empty() {
         let (message, help) = if missing > 0 {
             (
-                format!("run `{name}` has not finished its scores"),
+                format!("run `{}` has not finished its scores", run.name()),
                 run.read().map_or_else(
                     |_| "continue it with `reviv run FILE`".to_owned(),
                     |run| format!("continue it with `reviv run {}`", run.experiment),
@@ -292,7 +292,7 @@ pub fn entrants_of(
             )
         } else {
             (
-                format!("run `{name}` has no scores"),
+                format!("run `{}` has no scores", run.name()),
                 "add a stage with `op: evaluate`".to_owned(),
             )
         };

@@ -205,6 +205,7 @@ fn say(terminal: &Terminal, converted: &Converted, output: &Path, as_json: bool)
         terminal.json(&serde_json::json!({
             "folder": of_path(output), "shards": converted.shards, "reused": converted.reused,
             "clips": tally.clips, "dropped": tally.dropped, "damaged": tally.damaged,
+            "lost": tally.lost,
         }));
         return;
     }
@@ -212,11 +213,8 @@ fn say(terminal: &Terminal, converted: &Converted, output: &Path, as_json: bool)
         "{} clips in {} shards ({} were there)\n",
         tally.clips, converted.shards, converted.reused
     ));
-    for (reason, count) in &tally.dropped {
-        terminal.note(format_args!("{count} dropped: {reason}\n"));
-    }
-    for error in &tally.damaged {
-        terminal.note(format_args!("left out: {error}\n"));
+    for remark in tally.remarks() {
+        terminal.note(format_args!("{remark}\n"));
     }
     terminal.data(format_args!("{}\n", output.display()));
 }

@@ -115,10 +115,14 @@ pub(super) fn show(path: &Path, as_json: bool, terminal: &Terminal) -> Result<()
         terminal.json(&json!({
             "file": of_path(path), "format": format!("{:?}", checkpoint.format()), "entries": entries,
             "arguments": checkpoint.arguments(), "others": checkpoint.others(),
+            "wrappers": checkpoint.wrappers(), "opaque": checkpoint.opaque(),
         }));
         return Ok(());
     }
     let mut text = String::new();
+    for (name, what) in checkpoint.opaque() {
+        let _ = writeln!(text, "{name}  {what}");
+    }
     let width = entries.iter().map(|e| e.name.len()).max().unwrap_or(0);
     for entry in entries {
         let shape = format!("{:?}", entry.shape());

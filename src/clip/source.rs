@@ -50,6 +50,12 @@ pub trait ClipSource: Send + Sync {
         Vec::new()
     }
 
+    /// Signals that the recording of clip number `index` has and the clip goes without, each with the reason: `body: ...`.
+    fn lost(&self, index: usize) -> Vec<String> {
+        let _ = index;
+        Vec::new()
+    }
+
     /// Makes clip number `index`.
     ///
     /// # Errors

@@ -14,14 +14,13 @@ use super::recording::{
 };
 use super::track::{Joints, SECOND, Track};
 use crate::formats::read_error::Position;
-use crate::formats::text::read_json;
+use crate::formats::stays_inside;
+use crate::formats::text::{self, read_json};
 use crate::video::image::{Image, Turn};
 use nalgebra::Point3;
 use ndarray::Array2;
 use serde::de::{DeserializeSeed, IgnoredAny, MapAccess, SeqAccess, Visitor};
 use serde::{Deserialize, Deserializer};
-use std::fs::File;
-use std::io::BufReader;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -77,6 +76,14 @@ pub fn open(folder: &Path) -> Result<Recording, ReadError> {
     let depth = folder.join("depth_images.vrs");
     if depth.is_file() {
         recording.depth = depth_of(&depth, StreamId::RGB)?;
+        if recording.depth.is_none() {
+            recording.lacks(format!(
+                "no depth: `depth_images.vrs` has no stream of camera {}",
+                StreamId::RGB
+            ));
+        }
+    } else {
+        recording.lacks("no depth: `depth_images.vrs` is not there");
     }
 
     let track = trajectory::read(&folder.join("aria_trajectory.csv"))?;
@@ -87,10 +94,17 @@ pub fn open(folder: &Path) -> Result<Recording, ReadError> {
     if eyes.is_file() {
         let large = gaze::large_frame(&vrs.tags);
         recording.gaze = Some(aria_gaze(&eyes, large)?);
+    } else {
+        recording.lacks("no gaze: `eyegaze.csv` is not there");
     }
-    if let Some(skeleton) = skeleton_of(folder, vrs.tags.get("device_serial").map(String::as_str))?
-    {
-        recording.body = Some(read_skeleton(&skeleton)?);
+    match skeleton_of(folder, vrs.tags.get("device_serial").map(String::as_str))? {
+        Ok(skeleton) => {
+            recording.body = Some(read_skeleton(&skeleton)?);
+            if recording.up_world.is_none() {
+                recording.lacks(trajectory::NO_GRAVITY);
+            }
+        }
+        Err(reason) => recording.lacks(format!("no body: {reason}")),
     }
     Ok(recording)
 }
@@ -191,11 +205,16 @@ struct AssociatedSkeleton {
     name: String,
 }
 
-/// The skeleton of the person who wears these glasses.
-fn skeleton_of(folder: &Path, serial: Option<&str>) -> Result<Option<PathBuf>, ReadError> {
+/// The skeleton of the person who wears these glasses, or why there is none.
+fn skeleton_of(
+    folder: &Path,
+    serial: Option<&str>,
+) -> Result<Result<PathBuf, String>, ReadError> {
     let path = folder.join("skeleton_aria_association.json");
     if !path.is_file() {
-        return Ok(None);
+        return Ok(Err(
+            "`skeleton_aria_association.json` is not there".to_owned()
+        ));
     }
     let association: Association = read_json(&path)?;
     let mine = association
@@ -203,13 +222,27 @@ fn skeleton_of(folder: &Path, serial: Option<&str>) -> Result<Option<PathBuf>, R
         .iter()
         .find(|skeleton| serial.is_none_or(|serial| serial == skeleton.serial));
     let Some(mine) = mine else {
-        return Ok(None);
+        return Ok(Err(
+            "`skeleton_aria_association.json` has no skeleton of these glasses".to_owned(),
+        ));
     };
-    if mine.name.contains(['/', '\\']) || mine.name == "NONE" {
-        return Ok(None);
+    if mine.name == "NONE" {
+        return Ok(Err("the wearer had no markers".to_owned()));
     }
-    let named = folder.join(format!("{}.json", mine.name));
-    Ok(named.is_file().then_some(named))
+    let file = format!("{}.json", mine.name);
+    if !stays_inside(Path::new(&file)) || file.contains(['/', '\\']) {
+        return Err(ReadError::malformed(
+            &path,
+            Position::File,
+            format!("`{file}` is no name of a file beside it"),
+        ));
+    }
+    let named = folder.join(&file);
+    Ok(if named.is_file() {
+        Ok(named)
+    } else {
+        Err(format!("`{file}` is not there"))
+    })
 }
 
 /// The marker system's joints in our order.
@@ -237,10 +270,8 @@ pub fn body_from_markers(joints: &[Option<Point3<f64>>; JOINTS]) -> Joints {
 /// # Errors
 /// When the file is damaged; the line is named.
 pub fn read_skeleton(path: &Path) -> Result<Track<Joints>, ReadError> {
-    let file = File::open(path).map_err(|cause| ReadError::io(path, cause))?;
     let mut samples = Vec::new();
-    let mut deserializer =
-        serde_json::Deserializer::from_reader(BufReader::with_capacity(1 << 16, file));
+    let mut deserializer = serde_json::Deserializer::from_reader(text::open(path)?);
     deserializer
         .deserialize_map(SkeletonFile {
             samples: &mut samples,

@@ -52,6 +52,10 @@ impl ClipSource for Coded {
         self.source.notes()
     }
 
+    fn lost(&self, index: usize) -> Vec<String> {
+        self.source.lost(index)
+    }
+
     fn clip(&self, index: usize) -> Result<Outcome, ReadError> {
         let mut outcome = self.source.clip(index)?;
         if let Outcome::Clip(clip) = &mut outcome {

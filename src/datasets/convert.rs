@@ -58,12 +58,33 @@ pub struct Tally {
     pub dropped: BTreeMap<String, usize>,
     /// Damaged clips that were left out: the error of each.
     pub damaged: Vec<String>,
+    /// Clips that go without a signal that their recording has, by signal and reason.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub lost: BTreeMap<String, usize>,
 }
 
 impl Tally {
     /// Counts a dropped clip.
     pub(super) fn drop(&mut self, reason: DropReason) {
         *self.dropped.entry(reason.text().to_owned()).or_default() += 1;
+    }
+
+    /// Counts the signals that a clip goes without.
+    pub(super) fn lose(&mut self, signals: Vec<String>) {
+        for signal in signals {
+            *self.lost.entry(signal).or_default() += 1;
+        }
+    }
+
+    /// What became of clips beside those that are whole, one sentence each.
+    #[must_use]
+    pub fn remarks(&self) -> Vec<String> {
+        let dropped = self.dropped.iter();
+        let dropped = dropped.map(|(reason, count)| format!("{count} clips dropped: {reason}"));
+        let lost = self.lost.iter();
+        let lost = lost.map(|(reason, count)| format!("{count} clips without {reason}"));
+        let damaged = self.damaged.iter().map(|error| format!("left out: {error}"));
+        dropped.chain(lost).chain(damaged).collect()
     }
 
     /// Adds another one.
@@ -73,6 +94,9 @@ impl Tally {
             *self.dropped.entry(reason.clone()).or_default() += count;
         }
         self.damaged.extend(other.damaged.iter().cloned());
+        for (signal, count) in &other.lost {
+            *self.lost.entry(signal.clone()).or_default() += count;
+        }
     }
 }
 
@@ -123,7 +147,14 @@ pub fn convert(
     in_order(
         todo.len(),
         threads,
-        |position| source.clip(todo[position]),
+        |position| {
+            let outcome = source.clip(todo[position]);
+            let lost = match &outcome {
+                Ok(Outcome::Clip(_)) => source.lost(todo[position]),
+                _ => Vec::new(),
+            };
+            (outcome, lost)
+        },
         |outcomes| {
             let mut converted = Converted {
                 shards,
@@ -167,8 +198,11 @@ pub fn convert(
     )
 }
 
+/// A clip, and the signals that it goes without.
+type Made = (Result<Outcome, ReadError>, Vec<String>);
+
 /// The clips of one shard as they come.
-struct Shard<'a, 'b, I: Iterator<Item = Result<Outcome, ReadError>>> {
+struct Shard<'a, 'b, I: Iterator<Item = Made>> {
     outcomes: &'a mut I,
     left: usize,
     skip_damaged: bool,
@@ -178,13 +212,13 @@ struct Shard<'a, 'b, I: Iterator<Item = Result<Outcome, ReadError>>> {
     progress: Progress,
 }
 
-impl<I: Iterator<Item = Result<Outcome, ReadError>>> Iterator for Shard<'_, '_, I> {
+impl<I: Iterator<Item = Made>> Iterator for Shard<'_, '_, I> {
     type Item = Result<Clip, ReadError>;
 
     fn next(&mut self) -> Option<Self::Item> {
         while self.left > 0 && !self.interrupted {
             self.left -= 1;
-            let outcome = self.outcomes.next()?;
+            let (outcome, lost) = self.outcomes.next()?;
             self.progress.done += 1;
             if (self.watch)(&self.progress).is_break() && self.progress.done < self.progress.total {
                 self.interrupted = true;
@@ -194,6 +228,7 @@ impl<I: Iterator<Item = Result<Outcome, ReadError>>> Iterator for Shard<'_, '_, 
             match outcome {
                 Ok(Outcome::Clip(clip)) => {
                     tally.clips += 1;
+                    tally.lose(lost);
                     return Some(Ok(*clip));
                 }
                 Ok(Outcome::Dropped { reason, .. }) => tally.drop(reason),

@@ -140,6 +140,17 @@ impl Recordings {
     /// Gives the clips these modalities too, from the npz file of each recording that a declaration names.
     #[must_use]
     pub fn with_declared(mut self, declared: &[DeclaredSettings]) -> Self {
+        for settings in declared {
+            let Some(file) = &settings.source.npz else {
+                continue;
+            };
+            let lack = |folder: &&PathBuf| !folder.join(file).is_file();
+            let count = self.folders.iter().filter(lack).count();
+            if count > 0 {
+                let note = format!("no `{}`: `{file}` is not there", settings.name);
+                self.notes.insert(note, count);
+            }
+        }
         self.declared = declared.to_vec();
         self
     }
@@ -230,6 +241,18 @@ impl ClipSource for Recordings {
     fn notes(&self) -> Vec<(String, usize)> {
         let notes = self.notes.iter();
         notes.map(|(note, count)| (note.clone(), *count)).collect()
+    }
+
+    fn lost(&self, index: usize) -> Vec<String> {
+        let number = self.starts.partition_point(|start| *start <= index) - 1;
+        let Some(start) = self.starts.get(number).filter(|_| index < self.len()) else {
+            return Vec::new();
+        };
+        // What cannot be read is an error of the clip itself.
+        self.recording(number).map_or_else(
+            |_| Vec::new(),
+            |recording| recording.0.lost(index - start, &self.settings),
+        )
     }
 
     fn clip(&self, index: usize) -> Result<Outcome, ReadError> {

@@ -14,7 +14,7 @@ use super::aria::vrs::{StreamId, Vrs};
 use super::csv::Table;
 use super::dataset::{Recordings, find};
 use super::recording::{ColourFrames, CutSettings, MountedCamera, Recording};
-use super::track::{ClockMap, SECOND, Track};
+use super::track::{ClockMap, SECOND, Track, nearest};
 use super::umetrack::{self, HandProfile};
 use crate::formats::read_error::Position;
 use crate::formats::text::read_json;
@@ -130,14 +130,21 @@ fn open_aria(folder: &Path, name: &str) -> Result<Recording, ReadError> {
         }));
     } else {
         recording.span = frame_span(folder, "214-1")?;
+        recording.lacks("no rgb: `recording.vrs` is not there");
+    }
+    if slam.is_none() {
+        recording.lacks("`mps/slam/closed_loop_trajectory.csv` is not there: up is taken to be z");
     }
     if clock.is_none() {
         clock = slam.as_ref().and_then(|slam| match_clocks(slam, &headset));
     }
-    recording.hands = hands(folder)?;
+    take_hands(folder, "214-1", &mut recording)?;
     recording.device = Some(headset);
     if let Some(clock) = clock {
         let calibration = folder.join("mps/slam/online_calibration.jsonl");
+        if !calibration.is_file() {
+            recording.lacks("no gaze, and nothing in the camera: `mps/slam/online_calibration.jsonl` is not there");
+        }
         if calibration.is_file() {
             recording.cameras = calibration::online(&calibration, side)?
                 .into_iter()
@@ -151,7 +158,13 @@ fn open_aria(folder: &Path, name: &str) -> Result<Recording, ReadError> {
         {
             recording.gaze =
                 Some(aria_gaze(&eyes, large_frame)?.on_clock(|time| Some(clock.map(time))));
+        } else {
+            recording.lacks("no gaze: `mps/eye_gaze/general_eye_gaze.csv` is not there");
         }
+    } else {
+        recording.lacks(
+            "no gaze, and no calibration over time: without `recording.vrs` or rows that `headset_trajectory.csv` shares with `mps/slam/closed_loop_trajectory.csv`, the glasses' clock is not known",
+        );
     }
     Ok(recording)
 }
@@ -175,22 +188,82 @@ fn open_quest(folder: &Path, name: &str) -> Result<Recording, ReadError> {
         }));
     } else {
         recording.span = frame_span(folder, "1201-1")?;
+        recording.lacks("no rgb: `recording.vrs` is not there");
     }
-    recording.hands = hands(folder)?;
+    take_hands(folder, "1201-1", &mut recording)?;
     Ok(recording)
 }
 
-type Hands = [Option<Track<super::track::Joints>>; 2];
-
-fn hands(folder: &Path) -> Result<Hands, ReadError> {
+/// The hands, without the samples of frames whose ground truth did not pass the data set's quality check.
+fn take_hands(folder: &Path, stream: &str, recording: &mut Recording) -> Result<(), ReadError> {
+    /// Between two frames at 30 Hz.
+    const SAME_FRAME: i64 = SECOND / 60;
     let poses = folder.join("umetrack_hand_pose_trajectory.jsonl");
     let profile = folder.join("umetrack_hand_user_profile.json");
-    // Test participants come without ground truth.
-    if !poses.is_file() || !profile.is_file() {
-        return Ok([None, None]);
+    for file in [&poses, &profile] {
+        // Test participants come without ground truth.
+        if !file.is_file() {
+            let name = file.file_name().unwrap_or_default().to_string_lossy();
+            recording.lacks(format!("no left_hand and right_hand: `{name}` is not there"));
+            return Ok(());
+        }
     }
     let profile = HandProfile::read(&profile)?;
-    Ok(umetrack::read(&poses, &profile)?.map(Some))
+    let mut hands = umetrack::read(&poses, &profile)?;
+    let mask = folder.join("masks/mask_qa_pass.csv");
+    if mask.is_file() {
+        let frames = mask_of(&mask, stream)?;
+        let times: Vec<i64> = frames.iter().map(|(time, _)| *time).collect();
+        let failed = |time: i64| {
+            nearest(&times, time)
+                .is_some_and(|at| !frames[at].1 && (times[at] - time).abs() <= SAME_FRAME)
+        };
+        let count: usize = hands
+            .iter()
+            .map(|hand| hand.times().iter().filter(|time| failed(**time)).count())
+            .sum();
+        if count > 0 {
+            hands = hands.map(|hand| {
+                let samples = hand.times().iter().zip(hand.values());
+                let samples = samples
+                    .map(|(time, joints)| (*time, if failed(*time) { [None; 21] } else { *joints }));
+                Track::new(samples.collect(), SECOND / 10, SECOND / 50)
+            });
+            recording.lacks(
+                "hands of frames that failed the quality check (`masks/mask_qa_pass.csv`) are invalid",
+            );
+        }
+    }
+    recording.hands = hands.map(Some);
+    Ok(())
+}
+
+/// Times of the frames of a stream (of all streams where the mask has no row of it), ascending, and whether each has the mark.
+fn mask_of(path: &Path, stream: &str) -> Result<Vec<(i64, bool)>, ReadError> {
+    let mut table = Table::open(path)?;
+    let time = table.column("timestamp[ns]")?;
+    let (id, mark) = (table.column("stream_id")?, table.column("mask")?);
+    let mut rows: Vec<(bool, i64, bool)> = Vec::new();
+    while let Some(row) = table.next_row() {
+        let row = row?;
+        let passed = match row.text(mark) {
+            "True" | "true" | "TRUE" | "1" | "1.0" => true,
+            "False" | "false" | "FALSE" | "0" | "0.0" => false,
+            other => {
+                let other: String = other.chars().take(40).collect();
+                return Err(row.error(format!("`{other}` is neither `True` nor `False`")));
+            }
+        };
+        rows.push((row.text(id) == stream, row.integer(time)?, passed));
+    }
+    let own = rows.iter().any(|(own, ..)| *own);
+    let mut frames: Vec<(i64, bool)> = rows
+        .into_iter()
+        .filter(|(is_own, ..)| *is_own || !own)
+        .map(|(_, time, passed)| (time, passed))
+        .collect();
+    frames.sort_unstable();
+    Ok(frames)
 }
 
 /// `T_world_device`; in this table quaternions start with w.

@@ -64,6 +64,11 @@ fn first(folder: &Path, names: &[&str]) -> Option<PathBuf> {
         .find(|path| path.is_file())
 }
 
+/// What to say where a file of the services is not there under any of its names.
+fn absent(what: &str, names: &[&str]) -> String {
+    format!("no {what}: `{}` is not there, in `mps` or beside it", names[0])
+}
+
 /// The recording itself: `video.vrs`, `recording.vrs`, or the only VRS file in the folder.
 fn container(folder: &Path) -> Result<Option<PathBuf>, ReadError> {
     let fail = |cause| ReadError::io(folder, cause);
@@ -114,12 +119,17 @@ pub fn open(folder: &Path) -> Result<Recording, ReadError> {
             .get("calib_json")
             .cloned()
             .map(|text| (video, text));
+        if vrs.of(StreamId::RGB, Kind::Data).next().is_none() {
+            recording.lacks("no rgb: the VRS file has no pictures of camera-rgb");
+        }
         // Recordings are also published without their image streams.
         if vrs.of(StreamId::RGB, Kind::Data).next().is_some() {
             let pictures = Pictures::new(vrs, StreamId::RGB)?;
             side = pictures.size().map_or(1408, |(width, _)| width);
             recording.colour = Some(Box::new(VrsColour { pictures }));
         }
+    } else {
+        recording.lacks("no rgb: there is no VRS file, or several and none is called `recording.vrs`");
     }
     if let Some(path) = first(folder, &CALIBRATIONS) {
         recording.cameras = calibration::online(&path, side)?
@@ -131,9 +141,19 @@ pub fn open(folder: &Path) -> Result<Recording, ReadError> {
             ReadError::malformed(&video, Position::File, format!("calib_json: {reason}"))
         })?;
         recording.cameras = vec![(0, camera.into())];
+    } else {
+        recording.lacks(absent("camera, gaze, hands in the camera and body", &CALIBRATIONS));
+    }
+    if recording.up_world.is_none() {
+        recording.lacks("the trajectory does not say where gravity points (columns `gravity_x_world`, ...)");
     }
     if let Some(path) = first(folder, &GAZES) {
         recording.gaze = Some(aria_gaze(&path, large_frame)?);
+    } else {
+        recording.lacks(absent("gaze", &GAZES));
+    }
+    if first(folder, &HANDS).is_none() {
+        recording.lacks(absent("left_hand and right_hand", &HANDS));
     }
     if let Some(path) = first(folder, &HANDS) {
         let hands = hand_tracking::read(&path)?;

@@ -9,7 +9,7 @@ mod depth;
 mod lens;
 mod manifest;
 
-use arrays::{joints, load, nanoseconds, poses, shape, track};
+use arrays::{inside, joints, load, nanoseconds, poses, shape, track};
 use depth::depth;
 use lens::lens_of;
 use manifest::{GazeUnit, JointFrameEntry, Manifest};
@@ -97,7 +97,7 @@ pub fn open(root: &Path) -> Result<Recording, ReadError> {
         }
         recording.turn = Turn::from_degrees(entry.turn);
         let video = Video::open_with(
-            root.join(&entry.file),
+            inside(root, &entry.file)?,
             &VideoSettings {
                 folder_fps: entry.rate.unwrap_or(30.0),
                 ..VideoSettings::default()
@@ -168,7 +168,9 @@ pub fn open(root: &Path) -> Result<Recording, ReadError> {
             entry.rate,
             entry.times.as_deref(),
         )?;
-        let points = array.to_dim::<f64, ndarray::Ix2>()?;
+        let points = array
+            .to_dim::<f64, ndarray::Ix2>()
+            .map_err(|error| error.in_file(&root.join(&entry.file)))?;
         shape(&root.join(&entry.file), points.shape(), &[times.len(), 2])?;
         let size = entry.size.map(f64::from);
         let samples = times

@@ -17,7 +17,7 @@ use super::ReadError;
 use super::track::{Joints, SECOND, Track, nearest};
 use super::{DropReason, Outcome};
 use crate::clip::clock::{CLIP_SECONDS, SIGNAL_RATE, SIGNAL_SAMPLES};
-use crate::clip::frames::{gravity_frame_of, joints_in_camera, joints_in_frame};
+use crate::clip::frames::{FrameError, gravity_frame_of, joints_in_camera, joints_in_frame};
 use crate::clip::{BODY, CAMERA, Clip, DEPTH, GAZE, JointTrack, LEFT_HAND, RGB, RIGHT_HAND};
 use crate::geometry::camera::{Camera, KannalaBrandt, Lens};
 use crate::geometry::undistortion::Remap;
@@ -186,6 +186,11 @@ impl Recording {
         }
     }
 
+    /// Notes what is absent, in one sentence.
+    pub fn lacks(&mut self, what: impl Into<String>) {
+        self.notes.push(what.into());
+    }
+
     /// Whether clips can be cut as `settings` ask.
     ///
     /// # Errors
@@ -285,26 +290,66 @@ impl Recording {
         }
     }
 
+    /// The ticks of clip number `index`, whose first moment is `start`.
+    fn ticks(start: i64) -> Vec<i64> {
+        (0..SIGNAL_SAMPLES)
+            .map(|k| start + (k as f64 / SIGNAL_RATE * SECOND as f64).round() as i64)
+            .collect()
+    }
+
+    /// When clip number `index` begins.
+    fn start(&self, index: usize, settings: &CutSettings) -> Option<i64> {
+        let (first, _) = self.extent()?;
+        Some(first + (index as f64 * settings.stride * SECOND as f64).round() as i64)
+    }
+
+    /// Signals that this recording has and clip number `index` goes without, each with the reason.
+    #[must_use]
+    pub fn lost(&self, index: usize, settings: &CutSettings) -> Vec<String> {
+        let Some(start) = self.start(index, settings) else {
+            return Vec::new();
+        };
+        let camera = self.camera_track(&Self::ticks(start), settings);
+        let mut lost = Vec::new();
+        if self.body.is_some() {
+            let reason = match camera.as_ref().map(gravity_frame_of) {
+                Some(Ok(_)) => None,
+                None => Some("the recording has no camera poses"),
+                Some(Err(FrameError::NoUp)) => Some("which way is up is not known"),
+                Some(Err(FrameError::Degenerate { .. })) => {
+                    Some("the head is tilted sideways, and the clip has no heading")
+                }
+                Some(Err(_)) => Some("the clip's first camera pose is missing"),
+            };
+            lost.extend(reason.map(|reason| format!("body: {reason}")));
+        }
+        if camera.is_none() && self.hands_frame == JointFrame::World {
+            for (hand, name) in self.hands.iter().zip([LEFT_HAND, RIGHT_HAND]) {
+                if hand.is_some() {
+                    lost.push(format!("{name}: the recording has no camera poses"));
+                }
+            }
+        }
+        lost
+    }
+
     /// Makes clip number `index` (less than [`Recording::clips`]).
     ///
     /// # Errors
     /// When pictures cannot be read.
     pub fn clip(&self, index: usize, settings: &CutSettings) -> Result<Outcome, ReadError> {
         let id = format!("{}/{}/{index:06}", self.source, self.id);
-        let Some((first, _)) = self.extent() else {
+        let Some(start) = self.start(index, settings) else {
             return Ok(Outcome::Dropped {
                 id,
                 reason: DropReason::NothingValid,
             });
         };
-        let start = first + (index as f64 * settings.stride * SECOND as f64).round() as i64;
         let (rgb, depth) = match self.video(start, settings)? {
             Ok(video) => video,
             Err(reason) => return Ok(Outcome::Dropped { id, reason }),
         };
-        let ticks: Vec<i64> = (0..SIGNAL_SAMPLES)
-            .map(|k| start + (k as f64 / SIGNAL_RATE * SECOND as f64).round() as i64)
-            .collect();
+        let ticks = Self::ticks(start);
         let camera = self.camera_track(&ticks, settings);
         let gaze = self
             .gaze

@@ -9,6 +9,7 @@ use crate::clip::Clip;
 use crate::clip::shard::ShardError;
 use crate::clip::store::{self, ClipSet};
 use crate::formats::read_error::Position;
+use crate::formats::text::read_json;
 use crate::formats::write_atomically;
 use crate::modality::ClipFormat;
 use serde::{Deserialize, Serialize};
@@ -207,7 +208,7 @@ impl ShardClips {
         let id = first.1.ids().first().ok_or_else(absent)?;
         Ok(ShardClips {
             name: id.split('/').next().unwrap_or("clips").to_owned(),
-            format: described_format(root),
+            format: described_format(root)?,
             sets,
         })
     }
@@ -243,17 +244,29 @@ fn holds_shards(root: &Path) -> bool {
 }
 
 /// The sizes that the folder's own description, or that of the artifact it belongs to, speaks of.
-fn described_format(root: &Path) -> Option<ClipFormat> {
-    let read = |path: PathBuf| -> Option<serde_json::Value> {
-        serde_json::from_slice(&std::fs::read(path).ok()?).ok()
+///
+/// # Errors
+/// When a description is there and damaged.
+fn described_format(root: &Path) -> Result<Option<ClipFormat>, ReadError> {
+    let own = root.join(FILE);
+    let above = root.parent().map(|parent| parent.join("manifest.json"));
+    let manifests = [Some(root.join("manifest.json")), above];
+    let described = [Some(own.clone())].into_iter().chain(manifests).flatten();
+    let Some(path) = described.into_iter().find(|path| path.is_file()) else {
+        return Ok(None);
     };
-    let header = read(root.join(FILE)).map(|value| value["format"].clone());
-    let manifest = || {
-        let mut folders = [Some(root), root.parent()].into_iter().flatten();
-        let value = folders.find_map(|folder| read(folder.join("manifest.json")))?;
-        Some(value["contents"]["format"].clone())
+    let value: serde_json::Value = read_json(&path)?;
+    let format = if path == own {
+        &value["format"]
+    } else {
+        &value["contents"]["format"]
     };
-    serde_json::from_value(header.or_else(manifest)?).ok()
+    if format.is_null() {
+        return Ok(None);
+    }
+    serde_json::from_value(format.clone())
+        .map(Some)
+        .map_err(|error| ReadError::malformed(&path, Position::File, format!("`format`: {error}")))
 }
 
 impl ClipSource for ShardClips {

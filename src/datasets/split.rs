@@ -189,6 +189,11 @@ impl ClipSource for Chosen {
         self.source.notes()
     }
 
+    fn lost(&self, index: usize) -> Vec<String> {
+        let inside = self.indices.get(index);
+        inside.map_or_else(Vec::new, |inside| self.source.lost(*inside))
+    }
+
     fn clip(&self, index: usize) -> Result<Outcome, ReadError> {
         let inside = self.indices.get(index);
         let inside = inside.ok_or_else(|| ReadError::OutOfRange {

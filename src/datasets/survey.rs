@@ -77,14 +77,19 @@ pub fn survey(
             }
             other => other,
         });
-        (outcome, counted)
+        let lost = match &outcome {
+            Ok(Outcome::Clip(_)) => source.lost(chosen(position)),
+            _ => Vec::new(),
+        };
+        (outcome, counted, lost)
     };
     in_order(looked_at, rayon::current_num_threads(), make, |results| {
-        for (position, (outcome, counted)) in results.enumerate() {
+        for (position, (outcome, counted, lost)) in results.enumerate() {
             survey.looked_at += 1;
             match outcome {
                 Ok(Outcome::Clip(clip)) => {
                     survey.tally.clips += 1;
+                    survey.tally.lose(lost);
                     if kept.binary_search(&position).is_ok() {
                         survey.examples.push(*clip);
                     }

@@ -85,6 +85,8 @@ pub enum MetricError {
         index: usize,
         error: f64,
     },
+    #[error("{field}: the fourth row of pose {index} is not 0 0 0 1")]
+    NotAffine { field: &'static str, index: usize },
     #[error("{field}: shape {found:?} does not fit {expected:?}")]
     Shape {
         field: &'static str,

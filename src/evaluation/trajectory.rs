@@ -48,7 +48,7 @@ impl Pose {
 /// Poses out of `[T, 4, 4]` matrices.
 ///
 /// # Errors
-/// When the shape is another, an entry is not finite, or a rotation block is not a rotation (1e-4).
+/// When the shape is another, an entry is not finite, a rotation block is not a rotation (1e-4), or a fourth row not `0 0 0 1`.
 pub fn poses_from_matrices(
     matrices: ArrayView3<f64>,
     field: &'static str,
@@ -68,6 +68,10 @@ pub fn poses_from_matrices(
                 position: Vector3::from_fn(|r, _| matrices[(i, r, 3)]),
             };
             check(&pose, i, field)?;
+            let last = [0.0, 0.0, 0.0, 1.0];
+            if (0..4).any(|c| (matrices[(i, 3, c)] - last[c]).abs() > 1e-6) {
+                return Err(MetricError::NotAffine { field, index: i });
+            }
             Ok(pose)
         })
         .collect()

@@ -101,6 +101,13 @@ pub(crate) fn read_whole(path: &Path, limit: u64) -> Result<Vec<u8>, FormatError
     read().map_err(|error: FormatError| error.in_file(path))
 }
 
+/// Whether a path that a file names stays below the folder it is joined to: neither absolute nor with `..`.
+pub(crate) fn stays_inside(path: &Path) -> bool {
+    use std::path::Component;
+    let plain = |part| matches!(part, Component::Normal(_) | Component::CurDir);
+    !path.as_os_str().is_empty() && path.components().all(plain)
+}
+
 /// A temporary file in `folder` that will be renamed, with the rights that a file made in place would have: the process's umask
 /// applies, where the default of `tempfile` would hide the file from colleagues.
 pub(crate) fn temporary_in(folder: &Path) -> std::io::Result<tempfile::NamedTempFile> {

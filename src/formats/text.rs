@@ -154,6 +154,23 @@ pub fn decode(bytes: Vec<u8>) -> Result<String, String> {
     Ok(text)
 }
 
+/// A text file to be streamed, its byte order mark passed over.
+///
+/// # Errors
+/// When it cannot be opened or read.
+pub fn open(path: &Path) -> Result<BufReader<File>, ReadError> {
+    let fail = |cause| ReadError::io(path, cause);
+    let mut reader = BufReader::with_capacity(1 << 16, File::open(path).map_err(fail)?);
+    let head = reader.fill_buf().map_err(fail)?;
+    if is_utf16(head) {
+        return Err(ReadError::malformed(path, Position::Line(1), UTF16));
+    }
+    if head.starts_with("\u{feff}".as_bytes()) {
+        reader.consume('\u{feff}'.len_utf8());
+    }
+    Ok(reader)
+}
+
 /// Whether bytes begin as UTF-16 does: with its mark, or with ASCII between zeros.
 fn is_utf16(bytes: &[u8]) -> bool {
     match bytes {

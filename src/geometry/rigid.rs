@@ -10,12 +10,20 @@ pub type Rigid = Isometry3<f64>;
 const ROTATION_TOLERANCE: f64 = 1e-3;
 
 /// Why sixteen numbers are not a pose.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum PoseError {
     #[error("the pose has a value that is not finite")]
     NotFinite,
-    #[error("the pose's last row is not 0 0 0 1")]
+    #[error(
+        "the fourth row of the pose is not 0 0 0 1, its fourth column is: the matrix is transposed (column-major, as ARKit, ARCore and Unity hold it)"
+    )]
+    Transposed,
+    #[error("the fourth row of the pose is not 0 0 0 1")]
     NotAffine,
+    #[error("the pose's rotation part is scaled by {0}: its columns must be of length one")]
+    Scaled(f64),
+    #[error("the pose's rotation part is mirrored: one of its axes points the other way")]
+    Mirrored,
     #[error("the pose's rotation part is not a rotation")]
     NotARotation,
 }
@@ -30,18 +38,31 @@ pub fn from_row_major(m: &[f64; 16]) -> Result<Rigid, PoseError> {
         return Err(PoseError::NotFinite);
     }
     let m = Matrix4::from_row_slice(m);
-    let last = m.row(3);
-    if last
-        .iter()
-        .zip([0.0, 0.0, 0.0, 1.0])
-        .any(|(a, b)| (a - b).abs() > 1e-6)
-    {
-        return Err(PoseError::NotAffine);
-    }
+    let is_last = |v: [f64; 4]| {
+        let last = [0.0, 0.0, 0.0, 1.0];
+        v.iter().zip(last).all(|(a, b)| (a - b).abs() <= 1e-6)
+    };
+    let row = std::array::from_fn(|k| m[(3, k)]);
+    let column = std::array::from_fn(|k| m[(k, 3)]);
     let r: Matrix3<f64> = m.fixed_view::<3, 3>(0, 0).into_owned();
-    let off = (r.transpose() * r - Matrix3::identity()).amax();
-    if off > ROTATION_TOLERANCE || r.determinant() < 0.0 {
-        return Err(PoseError::NotARotation);
+    let off = |r: &Matrix3<f64>| (r.transpose() * r - Matrix3::identity()).amax();
+    if !is_last(row) {
+        return Err(if is_last(column) && off(&r) <= ROTATION_TOLERANCE {
+            PoseError::Transposed
+        } else {
+            PoseError::NotAffine
+        });
+    }
+    if off(&r) > ROTATION_TOLERANCE {
+        let scale = r.determinant().cbrt();
+        return Err(if scale > 0.0 && off(&(r / scale)) <= ROTATION_TOLERANCE {
+            PoseError::Scaled(scale)
+        } else {
+            PoseError::NotARotation
+        });
+    }
+    if r.determinant() < 0.0 {
+        return Err(PoseError::Mirrored);
     }
     let rotation = rotation::nearest(&r).ok_or(PoseError::NotARotation)?;
     Ok(Rigid::from_parts(
@@ -115,7 +136,17 @@ mod tests {
         for v in &mut bad[0..3] {
             *v = -*v;
         }
-        assert_eq!(from_row_major(&bad), Err(PoseError::NotARotation));
+        assert_eq!(from_row_major(&bad), Err(PoseError::Mirrored));
+        let transposed = std::array::from_fn(|k| good[4 * (k % 4) + k / 4]);
+        assert_eq!(from_row_major(&transposed), Err(PoseError::Transposed));
+        bad = good;
+        for v in bad.iter_mut().take(12).enumerate().filter(|(k, _)| k % 4 < 3).map(|(_, v)| v) {
+            *v *= 0.5;
+        }
+        assert!(matches!(from_row_major(&bad), Err(PoseError::Scaled(s)) if (s - 0.5).abs() < 1e-9));
+        bad = good;
+        bad[15] = 2.0;
+        assert_eq!(from_row_major(&bad), Err(PoseError::NotAffine));
     }
 
     #[test]

@@ -1,7 +1,6 @@
 //! What may happen to an entry of a released checkpoint. Nothing is dropped before it has been shown to be redundant.
 
 use super::{Checkpoint, ImportError};
-use crate::formats::pickle::Scalar;
 use crate::nn::positions::{self, GridOrder};
 use serde_json::Value;
 
@@ -144,11 +143,7 @@ impl Rule {
                 }
                 let found = checkpoint.values(index)?;
                 // What the entry's own type can tell apart.
-                let tolerance = match checkpoint.entries()[index].scalar() {
-                    Scalar::BF16 => 1.0 / 256.0,
-                    Scalar::F16 => 1.0 / 2048.0,
-                    _ => 1e-6,
-                };
+                let tolerance = checkpoint.entries()[index].scalar().precision().max(1e-6);
                 let same = found
                     .iter()
                     .zip(values)
@@ -178,9 +173,13 @@ impl Rule {
                 } else {
                     f32::INFINITY
                 };
-                if error > TABLE_TOLERANCE {
+                let scalar = checkpoint.entries()[index].scalar();
+                // No value of a table is larger than one.
+                let tolerance = TABLE_TOLERANCE + scalar.precision();
+                if error > tolerance {
                     return refuse(format!(
-                        "differs by {error:.1e} from the position table of a {place:?} grid"
+                        "differs by {error:.1e} from the position table of a {place:?} grid; in {} it may differ by {tolerance:.1e}",
+                        scalar.name()
                     ));
                 }
                 grid = Some(place.clone());

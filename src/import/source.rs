@@ -17,7 +17,16 @@ pub(super) struct Source {
 impl Source {
     /// Opens a file and finds out what it is; no tensor is read.
     pub fn open(path: &Path, options: &ImportOptions) -> Result<Self, ImportError> {
-        let checkpoint = Checkpoint::open(path)?;
+        let mut checkpoint = Checkpoint::open(path)?;
+        if !known(&checkpoint) || checkpoint.has_wrapped_layers() {
+            checkpoint.unwrap_names();
+        }
+        if let (true, Some((name, what))) = (known(&checkpoint), checkpoint.opaque().first()) {
+            return Err(ImportError::refused(
+                path,
+                format!("`{name}` is {what}, which no part of a model is"),
+            ));
+        }
         let plan = if mget::matches(&checkpoint) {
             mget::plan(&checkpoint, options.heads)
         } else if vq::matches(&checkpoint) {
@@ -25,7 +34,11 @@ impl Source {
         } else if cosmos::matches(&checkpoint) {
             cosmos::plan(&checkpoint, options.compression)
         } else {
-            Err("neither a transformer nor a tokenizer of a known release".to_owned())
+            let mut reason = "neither a transformer nor a tokenizer of a known release".to_owned();
+            if let Some(entry) = checkpoint.entries().first() {
+                reason += &format!("; its first tensor is called `{}`", entry.name);
+            }
+            Err(reason)
         };
         Ok(Self {
             plan: plan.map_err(|reason| ImportError::refused(path, reason))?,
@@ -60,6 +73,21 @@ impl Source {
             }
             self.accounts.insert(name, verdict.action);
         }
+        let wrappers = self.checkpoint.wrappers();
+        // Every trainer has one of these around its weights.
+        if !matches!(wrappers, [] | [_] if wrappers.iter().all(|w| w == "model" || w == "state_dict"))
+        {
+            notices.push(format!(
+                "{}: read without what is wrapped around its names: `{}`",
+                self.path().display(),
+                wrappers.join("`, `")
+            ));
+        }
+        let averages = self.checkpoint.others().iter();
+        for name in averages.filter(|name| name.contains("ema")) {
+            let path = self.path().display();
+            notices.push(format!("{path}: its averaged weights, `{name}`, are not used"));
+        }
         for (why, count) in left_out {
             let path = self.path().display();
             notices.push(format!("{path}: {count} entries left out: {why}"));
@@ -81,15 +109,21 @@ impl Source {
             "bytes": bytes,
             "part": self.plan.part,
             "not_weights": self.checkpoint.others(),
+            "wrappers": self.checkpoint.wrappers(),
             "arguments": self.checkpoint.arguments(),
             "entries": entries,
         })
     }
 }
 
+/// Whether the names are those of a release.
+fn known(checkpoint: &Checkpoint) -> bool {
+    mget::matches(checkpoint) || vq::matches(checkpoint) || cosmos::matches(checkpoint)
+}
+
 /// Files, and those in folders (and their `norm_stats`), sorted.
 pub(super) fn expand(files: &[PathBuf]) -> Result<Vec<PathBuf>, ImportError> {
-    const EXTENSIONS: [&str; 5] = ["pth", "pt", "jit", "safetensors", "npy"];
+    const EXTENSIONS: [&str; 6] = ["pth", "pt", "ckpt", "jit", "safetensors", "npy"];
     let mut all = Vec::new();
     let mut folders = Vec::new();
     for path in files {
@@ -107,7 +141,11 @@ pub(super) fn expand(files: &[PathBuf]) -> Result<Vec<PathBuf>, ImportError> {
                 .extension()
                 .and_then(|e| e.to_str())
                 .is_some_and(|e| EXTENSIONS.contains(&e));
-            if known && path.is_file() {
+            // macOS lays `._name` beside every file that it copies to another disk.
+            let hidden = path
+                .file_name()
+                .is_some_and(|name| name.as_encoded_bytes().starts_with(b"."));
+            if known && !hidden && path.is_file() {
                 all.push(path);
             }
         }

@@ -135,7 +135,9 @@ fn values(path: &Path, modality: &str, is_mean: bool) -> Result<Vec<f32>, Import
     if length > MAX_BYTES {
         return Err(ImportError::refused(path, format!("{length} bytes")));
     }
-    let array = npy::read(path)?.to::<f32>()?;
+    let array = npy::read(path)?
+        .to::<f32>()
+        .map_err(|error| error.in_file(path))?;
     let expected: &[usize] = if modality == "camera" { &[9] } else { &[21, 3] };
     let count: usize = expected.iter().product();
     if array.len() != count {

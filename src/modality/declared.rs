@@ -116,6 +116,23 @@ impl DeclaredSettings {
     /// What is wrong with the declaration, if anything, as (key, reason).
     pub fn problem(&self) -> Option<(&'static str, String)> {
         let signal = &self.signal;
+        // Names of modalities are names of folders and of arrays.
+        let plain = |c: char| c.is_ascii_alphanumeric() || matches!(c, '_' | '-' | '.' | '@');
+        if !self.name.chars().all(plain) || self.name.starts_with('.') || self.name.len() > 64 {
+            let name: String = self.name.chars().take(64).collect();
+            return Some((
+                "name",
+                format!("`{name}` is no name of a modality: letters, digits, `_`, `-`, `.` and `@`, at most 64, no dot in front"),
+            ));
+        }
+        if let Some(file) = &self.source.npz
+            && !crate::formats::stays_inside(std::path::Path::new(file))
+        {
+            return Some((
+                "source.npz",
+                format!("`{file}` is outside of the recording: a file of its folder is named, without `..`"),
+            ));
+        }
         if !(signal.rate.is_finite() && signal.rate > 0.0 && signal.rate <= 10_000.0) {
             return Some((
                 "signal.rate",

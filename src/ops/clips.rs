@@ -163,6 +163,7 @@ impl Op for Clips {
         };
         let mut done = 0;
         let mut splits = serde_json::Map::new();
+        let mut remarks: Vec<String> = Vec::new();
         let mut name = "world".to_owned();
         for (split, source) in &parts {
             source.name().clone_into(&mut name);
@@ -181,11 +182,20 @@ impl Op for Clips {
             }
             done += source.len() as u64;
             let tally = converted.tally;
-            for (reason, count) in &tally.dropped {
-                context.log(&format!("{split}: {count} clips dropped: {reason}"));
+            for remark in tally.remarks() {
+                context.log(&format!("{split}: {remark}"));
+                remarks.push(format!("{split}: {remark}"));
             }
-            for error in &tally.damaged {
-                context.log(&format!("{split}: left out: {error}"));
+            for (note, _) in source.notes() {
+                if !remarks.contains(&note) {
+                    remarks.push(note);
+                }
+            }
+            for excluded in source.excluded() {
+                let text = format!("excluded: `{}`: {}", excluded.recording, excluded.reason);
+                if !remarks.contains(&text) {
+                    remarks.push(text);
+                }
             }
             if tally.clips == 0 {
                 return Err(StageError::Input {
@@ -195,21 +205,30 @@ impl Op for Clips {
                         .to_owned(),
                 });
             }
-            splits.insert(
-                (*split).to_owned(),
-                json!({
-                    "clips": tally.clips, "shards": converted.shards, "dropped": tally.dropped,
-                    "damaged": tally.damaged,
-                }),
-            );
+            let mut account = json!({
+                "clips": tally.clips, "shards": converted.shards, "dropped": tally.dropped,
+                "damaged": tally.damaged,
+            });
+            if !tally.lost.is_empty() {
+                account["lost"] = json!(tally.lost);
+            }
+            splits.insert((*split).to_owned(), account);
         }
         for (split, _, _) in settings.splits() {
             let folder = context.checkpoints().join("clips").join(split);
             deliver(&folder, &context.output().join(split))?;
         }
-        Ok(json!({
+        let mut contents = json!({
             "source": name, "format": format, "splits": splits, (DEFAULTS): settings.defaults(),
-        }))
+        });
+        if !remarks.is_empty() {
+            let list: String = remarks.iter().map(|text| format!("* {text}\n")).collect();
+            let report = context.output().join("report");
+            std::fs::create_dir_all(&report).map_err(StageError::other)?;
+            std::fs::write(report.join("remarks.md"), list).map_err(StageError::other)?;
+            contents["remarks"] = json!(remarks);
+        }
+        Ok(contents)
     }
 }
 

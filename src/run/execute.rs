@@ -12,7 +12,7 @@ use super::record::{Owned, RunDirectory, Shard, State};
 use super::schedule::{Schedule, Task};
 use super::stage::{self, Surroundings};
 use super::worker_pool::{Ended, WorkerPool};
-use super::{provenance, report};
+use super::{gc, provenance, report};
 use crate::experiment::Experiment;
 use std::collections::BTreeSet;
 use std::path::Path;
@@ -57,6 +57,9 @@ pub fn execute(job: &Job<'_>) -> Result<Outcome, RunError> {
     let schedule = Schedule::of(job.experiment, prints)?;
     let targets = schedule.targets(job.only, job.shard)?;
     let asked = job.experiment.path.display().to_string();
+    let planning = gc::keep_away(job.runs, job.interrupt, |_| {
+        job.progress.say("  waiting for `reviv gc`");
+    })?;
     let run = RunDirectory::find_or_create(
         job.runs,
         &schedule.name,
@@ -85,7 +88,9 @@ pub fn execute(job: &Job<'_>) -> Result<Outcome, RunError> {
         run: &run,
         made: AtomicUsize::new(0),
     };
-    let Ended { mut failures, end } = match provenance::write(job, &schedule, &run) {
+    let planned = provenance::write(job, &schedule, &run);
+    drop(planning);
+    let Ended { mut failures, end } = match planned {
         Ok(()) => worker.work(&targets),
         Err(error) => Ended {
             end: Some(error),

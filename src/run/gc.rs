@@ -1,9 +1,10 @@
 //! Prunes the cache: what no run directory refers to, what is damaged, and what killed processes left behind.
 
 use super::cache::Key;
-use super::error::{AtPath, RunError};
+use super::error::{AtPath, Holder, RunError};
 use super::execute::cache_of;
 use super::files;
+use super::interrupt::Interrupt;
 use super::lock::{Lock, Mode};
 use super::record::{RunDirectory, State};
 use super::schedule::Schedule;
@@ -11,6 +12,20 @@ use super::stage::StageRecord;
 use serde::Serialize;
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
+
+/// Held by who prunes, alone; and shared by every run from before it looks into the cache until its plan is written. Taken before
+/// any other lock.
+const PRUNING: &str = ".lock-gc";
+
+/// Keeps `reviv gc` away until it is dropped: for a run that begins.
+pub(super) fn keep_away(
+    runs: &Path,
+    interrupt: &Interrupt,
+    waiting: impl FnOnce(Option<Holder>),
+) -> Result<Lock, RunError> {
+    files::create_directory(runs)?;
+    Lock::wait_as(&runs.join(PRUNING), Mode::Shared, interrupt, waiting)
+}
 
 /// What was pruned, or would be.
 #[derive(Debug, Default, Serialize)]
@@ -35,6 +50,16 @@ pub struct Options {
 pub fn prune(runs: &Path, options: Options) -> Result<Pruned, RunError> {
     let cache = cache_of(runs);
     let mut pruned = Pruned::default();
+    if !runs.is_dir() {
+        return Ok(pruned);
+    }
+    // From here to the end no run begins: one that has looked into the cache has said what it refers to, or has not looked yet.
+    let _alone = if options.dry_run {
+        None
+    } else {
+        let never = Interrupt::default();
+        Some(Lock::wait(&runs.join(PRUNING), &never, |_| {})?)
+    };
     let (referred, checkpoints) = referred(runs)?;
     for leaf in cache.entries()? {
         let whole = leaf.extension.is_empty();

@@ -77,9 +77,19 @@ impl Lock {
         interrupt: &Interrupt,
         waiting: impl FnOnce(Option<Holder>),
     ) -> Result<Self, RunError> {
+        Self::wait_as(path, Mode::Exclusive, interrupt, waiting)
+    }
+
+    /// [`Lock::wait`], alone or together with others.
+    pub fn wait_as(
+        path: &Path,
+        mode: Mode,
+        interrupt: &Interrupt,
+        waiting: impl FnOnce(Option<Holder>),
+    ) -> Result<Self, RunError> {
         let mut waiting = Some(waiting);
         loop {
-            if let Some(lock) = Self::attempt(path, Mode::Exclusive)? {
+            if let Some(lock) = Self::attempt(path, mode)? {
                 return Ok(lock);
             }
             if let Some(tell) = waiting.take() {

@@ -163,6 +163,9 @@ fn words(found: &Survey, source: &dyn ClipSource) -> String {
     for (reason, count) in &found.tally.dropped {
         let _ = writeln!(text, "dropped: {count}, {reason}");
     }
+    for (reason, count) in &found.tally.lost {
+        let _ = writeln!(text, "{count} clips without {reason}");
+    }
     for error in &found.tally.damaged {
         let _ = writeln!(text, "damaged: {error}");
     }

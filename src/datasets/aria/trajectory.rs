@@ -24,6 +24,17 @@ pub struct Trajectory {
     pub first_rows: Vec<(i64, Vector3<f64>)>,
 }
 
+/// How gravity in the world is called, the newest name first.
+const GRAVITY: [&str; 4] = [
+    "gravity_{}_world",
+    "gravity_{}",
+    "gravity_world_{}",
+    "g{}_world",
+];
+/// What to say of a trajectory without it.
+pub const NO_GRAVITY: &str =
+    "no body: the trajectory does not say where gravity points (columns `gravity_x_world`, `gravity_y_world`, `gravity_z_world`)";
+
 /// Rows kept as written.
 const FIRST_ROWS: usize = 4096;
 
@@ -36,7 +47,7 @@ pub fn read(path: &Path) -> Result<Trajectory, ReadError> {
     let time = table.column("tracking_timestamp_us")?;
     let position = table.columns("t{}_world_device", ["x", "y", "z"])?;
     let rotation = table.columns("q{}_world_device", ["x", "y", "z", "w"])?;
-    let gravity = table.columns("gravity_{}_world", ["x", "y", "z"]).ok();
+    let gravity = table.columns_of_any(&GRAVITY, ["x", "y", "z"])?;
     let mut samples: Vec<(i64, Isometry3<f64>)> = Vec::new();
     let mut first_rows = Vec::new();
     let mut up_world = None;

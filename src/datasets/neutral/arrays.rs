@@ -6,9 +6,11 @@ use crate::datasets::track::{Joints, SECOND, Track};
 use crate::formats::ReadError;
 use crate::formats::npy::{self, NpyArray};
 use crate::formats::npz::Npz;
+use crate::formats::stays_inside;
 use crate::formats::read_error::Position;
-use nalgebra::{Isometry3, Matrix3, Point3, Rotation3, UnitQuaternion, Vector3};
-use std::path::Path;
+use crate::geometry::rigid;
+use nalgebra::{Isometry3, Point3, Rotation3, UnitQuaternion};
+use std::path::{Path, PathBuf};
 
 pub(super) fn nanoseconds(path: &Path, seconds: f64) -> Result<i64, ReadError> {
     // A century on either side.
@@ -34,6 +36,21 @@ pub(super) fn array(path: &Path, key: Option<&str>) -> Result<NpyArray, ReadErro
         .ok_or_else(|| ReadError::missing(path, format!("there is no array `{key}`")))
 }
 
+/// A file that the manifest names: of the recording's own folder.
+pub(super) fn inside(root: &Path, file: &Path) -> Result<PathBuf, ReadError> {
+    if stays_inside(file) {
+        return Ok(root.join(file));
+    }
+    Err(ReadError::malformed(
+        &root.join(FILE),
+        Position::File,
+        format!(
+            "`{}` is outside of the recording: files are named by their path below its folder, without `..`",
+            file.display()
+        ),
+    ))
+}
+
 /// An array and the times of its rows.
 pub(super) fn load(
     root: &Path,
@@ -43,7 +60,7 @@ pub(super) fn load(
     rate: Option<f64>,
     times: Option<&str>,
 ) -> Result<(NpyArray, Vec<i64>), ReadError> {
-    let path = root.join(file);
+    let path = inside(root, file)?;
     let values = array(&path, key)?;
     let count = values.shape.first().copied().unwrap_or(0);
     if count == 0 {
@@ -55,7 +72,8 @@ pub(super) fn load(
     }
     let times: Vec<i64> = match (times, rate) {
         (Some(times), _) => array(&path, Some(times))?
-            .to::<f64>()?
+            .to::<f64>()
+            .map_err(|error| error.in_file(&path))?
             .iter()
             .map(|seconds| nanoseconds(&path, *seconds))
             .collect::<Result<_, _>>()?,
@@ -111,7 +129,9 @@ pub(super) fn poses(
     array: &NpyArray,
     entry: &CameraEntry,
 ) -> Result<Vec<Option<Isometry3<f64>>>, ReadError> {
-    let matrices = array.to_dim::<f64, ndarray::Ix3>()?;
+    let matrices = array
+        .to_dim::<f64, ndarray::Ix3>()
+        .map_err(|error| error.in_file(path))?;
     let rows = matrices.shape()[1];
     shape(
         path,
@@ -125,20 +145,12 @@ pub(super) fn poses(
             if m.iter().any(|v| !v.is_finite()) {
                 return Ok(None);
             }
-            let rotation = Matrix3::from_fn(|r, c| m[[r, c]]);
-            if (rotation * rotation.transpose() - Matrix3::identity()).norm() > 1e-2
-                || rotation.determinant() < 0.0
-            {
-                return Err(ReadError::malformed(
-                    path,
-                    Position::Frame(index as u64),
-                    "the pose is no rotation",
-                ));
-            }
-            let pose = Isometry3::from_parts(
-                Vector3::new(m[[0, 3]], m[[1, 3]], m[[2, 3]]).into(),
-                UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix(&rotation)),
-            );
+            let mut values = [0.0; 16];
+            values[15] = 1.0;
+            values.iter_mut().zip(&m).for_each(|(slot, &v)| *slot = v);
+            let pose = rigid::from_row_major(&values).map_err(|error| {
+                ReadError::malformed(path, Position::Frame(index as u64), error.to_string())
+            })?;
             let pose = match entry.direction {
                 Direction::CameraToWorld => pose,
                 Direction::WorldToCamera => pose.inverse(),
@@ -161,7 +173,9 @@ pub(super) fn joints(
         entry.rate,
         entry.times.as_deref(),
     )?;
-    let values = array.to_dim::<f64, ndarray::Ix3>()?;
+    let values = array
+        .to_dim::<f64, ndarray::Ix3>()
+        .map_err(|error| error.in_file(&root.join(&entry.file)))?;
     let (map, count) = entry.order.map();
     shape(
         &root.join(&entry.file),

@@ -1,15 +1,19 @@
 //! Depth of a recording: an array, or a folder of pictures.
 
 use super::FILE;
-use super::arrays::{load, nanoseconds};
+use super::arrays::{inside, load, nanoseconds};
 use super::manifest::DepthEntry;
 use crate::datasets::recording::DepthFrames;
 use crate::formats::ReadError;
 use crate::formats::read_error::Position;
+use crate::formats::read_whole;
 use crate::video::folder;
 use crate::video::image::grey16_from_png;
 use ndarray::{Array2, Array3, Axis};
 use std::path::{Path, PathBuf};
+
+/// More than a picture has, uncompressed.
+const MAX_PICTURE: u64 = 1 << 30;
 
 enum DepthFiles {
     Array(Array3<f32>),
@@ -23,7 +27,7 @@ struct NeutralDepth {
 }
 
 pub(super) fn depth(root: &Path, entry: &DepthEntry) -> Result<Box<dyn DepthFrames>, ReadError> {
-    let path = root.join(&entry.file);
+    let path = inside(root, &entry.file)?;
     let scale = entry.unit.metres() as f32;
     let (files, times) = if path.is_dir() {
         let files = folder::list(&path)?;
@@ -50,7 +54,9 @@ pub(super) fn depth(root: &Path, entry: &DepthEntry) -> Result<Box<dyn DepthFram
             entry.rate,
             entry.times.as_deref(),
         )?;
-        let array = array.to_dim::<f32, ndarray::Ix3>()?;
+        let array = array
+            .to_dim::<f32, ndarray::Ix3>()
+            .map_err(|error| error.in_file(&path))?;
         if array.is_empty() {
             return Err(ReadError::malformed(
                 &path,
@@ -84,7 +90,7 @@ impl DepthFrames for NeutralDepth {
             DepthFiles::Array(array) => Ok(array.index_axis(Axis(0), index).mapv(metres)),
             DepthFiles::Pictures(files) => {
                 let path = &files[index];
-                let bytes = std::fs::read(path).map_err(|cause| ReadError::io(path, cause))?;
+                let bytes = read_whole(path, MAX_PICTURE)?;
                 let values = grey16_from_png(&bytes)
                     .map_err(|reason| ReadError::malformed(path, Position::File, reason))?;
                 Ok(values.mapv(|value| metres(f32::from(value))))

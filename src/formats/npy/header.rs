@@ -48,28 +48,32 @@ impl Header {
             }
         }
         let descr = found.0.ok_or_else(|| wrong("`descr`"))?;
-        let (order, kind) = descr.split_at(usize::from(descr.starts_with(['<', '>', '|', '='])));
-        let dtype = Dtype::ALL
-            .into_iter()
-            .find(|d| &d.code()[1..] == kind)
-            .ok_or_else(|| {
-                let why = if kind.starts_with('O') {
-                    ": objects would have to be unpickled"
-                } else {
-                    ""
-                };
-                malformed(
-                    start as u64,
-                    format!("elements of type `{descr}` are not read{why}"),
-                )
-            })?;
+        let (dtype, big_endian) =
+            dtype(descr).map_err(|reason| malformed(start as u64, reason))?;
         Ok(Self {
             dtype,
-            big_endian: order == ">",
+            big_endian,
             fortran: found.1.ok_or_else(|| wrong("`fortran_order`"))?,
             shape: found.2.ok_or_else(|| wrong("`shape`"))?,
             end,
         })
+    }
+}
+
+/// The element type that `descr` names, and whether its bytes are in big-endian order.
+pub(super) fn dtype(descr: &str) -> Result<(Dtype, bool), String> {
+    let (order, kind) = descr.split_at(usize::from(descr.starts_with(['<', '>', '|', '='])));
+    let dtype = Dtype::ALL.into_iter().find(|d| &d.code()[1..] == kind);
+    match dtype {
+        Some(dtype) => Ok((dtype, order == ">")),
+        None => Err(format!(
+            "elements of type `{descr}` are not read{}",
+            if kind.starts_with('O') {
+                ": objects would have to be unpickled"
+            } else {
+                ""
+            }
+        )),
     }
 }
 

@@ -45,6 +45,31 @@ pub fn write(path: &Path, array: &NpyArray) -> Result<(), FormatError> {
 pub fn parse(bytes: &[u8]) -> Result<NpyArray, FormatError> {
     let header = Header::parse(bytes)?;
     let body = &bytes[header.end..];
+    assemble(header, body)
+}
+
+/// An array whose type, order and shape are known from elsewhere: from a pickle.
+///
+/// # Errors
+/// When the type is none of those that are read, or the shape does not fit the bytes.
+pub fn from_parts(
+    descr: &str,
+    fortran: bool,
+    shape: &[usize],
+    body: &[u8],
+) -> Result<NpyArray, FormatError> {
+    let (dtype, big_endian) = header::dtype(descr).map_err(|reason| malformed(0, reason))?;
+    let header = Header {
+        dtype,
+        big_endian,
+        fortran,
+        shape: shape.to_vec(),
+        end: 0,
+    };
+    assemble(header, body)
+}
+
+fn assemble(header: Header, body: &[u8]) -> Result<NpyArray, FormatError> {
     let count = header
         .shape
         .iter()

@@ -1,7 +1,7 @@
 //! The interpreter: one pass over the opcodes, on an arena.
 
 use super::objects::long;
-use super::{Id, MAX_NODES, MAX_TEXT, Node, PickleError};
+use super::{CUT, Id, MAX_LINE, MAX_NODES, MAX_TEXT, Node, PickleError};
 use std::collections::BTreeMap;
 
 /// A pickle on its way.
@@ -14,6 +14,8 @@ pub(super) struct Machine<'a> {
     pub(super) stack: Vec<Id>,
     marks: Vec<usize>,
     memo: BTreeMap<u32, Id>,
+    /// Bytes that calls have copied so far.
+    pub(super) copied: usize,
 }
 
 impl<'a> Machine<'a> {
@@ -26,11 +28,12 @@ impl<'a> Machine<'a> {
             stack: Vec::new(),
             marks: Vec::new(),
             memo: BTreeMap::new(),
+            copied: 0,
         }
     }
 
-    /// All objects, and the one that the pickle is.
-    pub(super) fn run(mut self) -> Result<(Vec<Node>, Id), PickleError> {
+    /// All objects, the one that the pickle is, and where it ends.
+    pub(super) fn run(mut self) -> Result<(Vec<Node>, Id, usize), PickleError> {
         loop {
             self.start = self.at;
             if self.nodes.len() > MAX_NODES {
@@ -41,7 +44,7 @@ impl<'a> Machine<'a> {
                 // PROTO
                 0x80 => {
                     let version = self.u8()?;
-                    if !(2..=5).contains(&version) {
+                    if version > 5 {
                         return self.refuse(format!("protocol {version} is not read"));
                     }
                 }
@@ -49,7 +52,7 @@ impl<'a> Machine<'a> {
                 0x95 => drop(self.take(8)?),
                 b'.' => {
                     let root = self.pop()?;
-                    return Ok((self.nodes, root));
+                    return Ok((self.nodes, root, self.at));
                 }
                 b'(' => self.marks.push(self.stack.len()),
                 b'0' => drop(self.pop()?),
@@ -72,11 +75,54 @@ impl<'a> Machine<'a> {
                 // LONG1
                 0x8a => {
                     let length = self.u8()?;
-                    let bytes = self.take(length.into())?;
-                    let Some(value) = long(bytes) else {
-                        return self.refuse("an integer of more than 16 bytes");
+                    self.long(length.into())?;
+                }
+                // LONG4
+                0x8b => {
+                    let length = self.u32()? as usize;
+                    self.long(length)?;
+                }
+                // Numbers and texts of protocol 0 stand in lines.
+                b'I' | b'L' => {
+                    let line = self.line(MAX_LINE)?;
+                    let node = match (opcode, line) {
+                        (b'I', "00") => Node::Bool(false),
+                        (b'I', "01") => Node::Bool(true),
+                        _ => match line.trim_end_matches('L').parse() {
+                            Ok(value) => Node::Int(value),
+                            Err(_) => return self.refuse("a line that is no integer"),
+                        },
                     };
-                    self.push(Node::Int(value));
+                    self.push(node);
+                }
+                b'F' => match self.line(MAX_LINE)?.parse() {
+                    Ok(value) => self.push(Node::Float(value)),
+                    Err(_) => return self.refuse("a line that is no number"),
+                },
+                b'S' => {
+                    let Some(bytes) = unquoted(self.line_bytes(MAX_TEXT)?) else {
+                        return self.refuse("a text without its quotes");
+                    };
+                    self.push(text_or_bytes(bytes));
+                }
+                b'V' => {
+                    let Some(text) = unescaped(self.line_bytes(MAX_TEXT)?) else {
+                        return self.refuse("a text with an escape that is no character");
+                    };
+                    self.push(Node::Text(text));
+                }
+                // BINSTRING, SHORT_BINSTRING: what Python 2 called a string.
+                b'T' | b'U' => {
+                    let length = if opcode == b'T' {
+                        self.u32()? as usize
+                    } else {
+                        self.u8()?.into()
+                    };
+                    if length > MAX_TEXT {
+                        return self.refuse(format!("a text of {length} bytes"));
+                    }
+                    let bytes = self.take(length)?.to_vec();
+                    self.push(text_or_bytes(bytes));
                 }
                 b'G' => {
                     let value = f64::from_be_bytes(self.array()?);
@@ -93,8 +139,20 @@ impl<'a> Machine<'a> {
                     let text = self.text(length.into())?;
                     self.push(Node::Text(text));
                 }
+                // BINUNICODE8
+                0x8d => {
+                    let length = self.u64()?;
+                    let text = self.text(length)?;
+                    self.push(Node::Text(text));
+                }
                 b'B' => {
                     let length = self.u32()? as usize;
+                    let bytes = self.take(length)?.to_vec();
+                    self.push(Node::Bytes(bytes));
+                }
+                // BINBYTES8, BYTEARRAY8
+                0x8e | 0x96 => {
+                    let length = self.u64()?;
                     let bytes = self.take(length)?.to_vec();
                     self.push(Node::Bytes(bytes));
                 }
@@ -102,6 +160,25 @@ impl<'a> Machine<'a> {
                     let length = self.u8()?;
                     let bytes = self.take(length.into())?.to_vec();
                     self.push(Node::Bytes(bytes));
+                }
+                // EMPTY_SET, ADDITEMS, FROZENSET
+                0x8f => self.push(Node::Set(Vec::new())),
+                0x90 => {
+                    let items = self.pop_mark()?;
+                    self.append(&items)?;
+                }
+                0x91 => {
+                    let items = self.pop_mark()?;
+                    self.push(Node::Set(items));
+                }
+                b'l' => {
+                    let items = self.pop_mark()?;
+                    self.push(Node::List(items));
+                }
+                b'd' => {
+                    let items = self.pop_mark()?;
+                    self.push(Node::Dict(Vec::new()));
+                    self.set(&items)?;
                 }
                 b')' => self.push(Node::Tuple(Vec::new())),
                 b']' => self.push(Node::List(Vec::new())),
@@ -149,6 +226,16 @@ impl<'a> Machine<'a> {
                     let slot = self.memo.len() as u32;
                     self.remember(slot)?;
                 }
+                b'p' | b'g' => match self.line(MAX_LINE)?.parse() {
+                    Ok(slot) if opcode == b'p' => self.remember(slot)?,
+                    Ok(slot) => self.recall(slot)?,
+                    Err(_) => return self.refuse("a memo slot that is no number"),
+                },
+                // DUP
+                b'2' => {
+                    let top = self.top()?;
+                    self.stack.push(top);
+                }
                 b'h' => {
                     let slot = self.u8()?;
                     self.recall(slot.into())?;
@@ -158,10 +245,26 @@ impl<'a> Machine<'a> {
                     self.recall(slot)?;
                 }
                 b'c' => {
-                    let module = self.line()?;
-                    let name = self.line()?;
+                    let module = self.line(MAX_LINE)?;
+                    let name = self.line(MAX_LINE)?;
                     let global = self.global(module, name)?;
                     self.push(Node::Global(global));
+                }
+                // INST, OBJ: an instance with the arguments behind the mark.
+                b'i' => {
+                    let module = self.line(MAX_LINE)?;
+                    let name = self.line(MAX_LINE)?;
+                    let class = self.global(module, name)?;
+                    let arguments = self.pop_mark()?;
+                    self.construct(class, &arguments)?;
+                }
+                b'o' => {
+                    let arguments = self.pop_mark()?;
+                    let class = arguments.first().map(|&class| self.node(class));
+                    let Some(Node::Global(class)) = class.cloned() else {
+                        return self.refuse("an instance of something that is not a name");
+                    };
+                    self.construct(class, &arguments[1..])?;
                 }
                 // STACK_GLOBAL
                 0x93 => {
@@ -177,6 +280,14 @@ impl<'a> Machine<'a> {
                 b'R' => self.reduce()?,
                 // NEWOBJ
                 0x81 => self.new_object()?,
+                // NEWOBJ_EX
+                0x92 => {
+                    let named = self.pop()?;
+                    if !matches!(self.node(named), Node::Dict(pairs) if pairs.is_empty()) {
+                        return self.refuse("an instance made from named arguments");
+                    }
+                    self.new_object()?;
+                }
                 b'b' => self.build()?,
                 b'Q' => self.persistent()?,
                 other => {
@@ -197,7 +308,7 @@ impl<'a> Machine<'a> {
 
     fn take(&mut self, count: usize) -> Result<&'a [u8], PickleError> {
         let Some(bytes) = self.bytes[self.at..].get(..count) else {
-            return self.refuse("the pickle is cut short");
+            return self.refuse(CUT);
         };
         self.at += count;
         Ok(bytes)
@@ -217,6 +328,21 @@ impl<'a> Machine<'a> {
         Ok(u32::from_le_bytes(self.array()?))
     }
 
+    fn u64(&mut self) -> Result<usize, PickleError> {
+        let length = u64::from_le_bytes(self.array()?);
+        // More than there are bytes: taking them fails.
+        Ok(usize::try_from(length).unwrap_or(usize::MAX))
+    }
+
+    fn long(&mut self, length: usize) -> Result<(), PickleError> {
+        let bytes = self.take(length)?;
+        let Some(value) = long(bytes) else {
+            return self.refuse("an integer of more than 16 bytes");
+        };
+        self.push(Node::Int(value));
+        Ok(())
+    }
+
     fn text(&mut self, length: usize) -> Result<String, PickleError> {
         if length > MAX_TEXT {
             return self.refuse(format!("a text of {length} bytes"));
@@ -227,13 +353,18 @@ impl<'a> Machine<'a> {
         }
     }
 
-    fn line(&mut self) -> Result<&'a str, PickleError> {
+    fn line_bytes(&mut self, longest: usize) -> Result<&'a [u8], PickleError> {
         let rest = &self.bytes[self.at..];
-        let Some(end) = rest.iter().take(1024).position(|&b| b == b'\n') else {
-            return self.refuse("a name without an end");
+        let Some(end) = rest.iter().take(longest).position(|&b| b == b'\n') else {
+            return self.refuse("a line without an end");
         };
         self.at += end + 1;
-        match std::str::from_utf8(&rest[..end]) {
+        let line = &rest[..end];
+        Ok(line.strip_suffix(b"\r").unwrap_or(line))
+    }
+
+    fn line(&mut self, longest: usize) -> Result<&'a str, PickleError> {
+        match std::str::from_utf8(self.line_bytes(longest)?) {
             Ok(text) => Ok(text),
             Err(_) => self.refuse("a name that is not UTF-8"),
         }
@@ -277,7 +408,7 @@ impl<'a> Machine<'a> {
     fn append(&mut self, items: &[Id]) -> Result<(), PickleError> {
         let list = self.top()?;
         match &mut self.nodes[list.0 as usize] {
-            Node::List(list) => list.extend(items),
+            Node::List(list) | Node::Set(list) => list.extend(items),
             _ => return self.refuse("items appended to something that is not a list"),
         }
         Ok(())
@@ -308,4 +439,76 @@ impl<'a> Machine<'a> {
         }
         Ok(())
     }
+}
+
+/// A string of Python 2: text where it is UTF-8.
+fn text_or_bytes(bytes: Vec<u8>) -> Node {
+    match String::from_utf8(bytes) {
+        Ok(text) => Node::Text(text),
+        Err(error) => Node::Bytes(error.into_bytes()),
+    }
+}
+
+/// The bytes of a string literal as `repr` writes it.
+fn unquoted(line: &[u8]) -> Option<Vec<u8>> {
+    let line = line.trim_ascii();
+    let inside = match line {
+        [b'\'', inside @ .., b'\''] | [b'"', inside @ .., b'"'] => inside,
+        _ => return None,
+    };
+    let mut out = Vec::with_capacity(inside.len());
+    let mut rest = inside.iter().copied();
+    while let Some(byte) = rest.next() {
+        if byte != b'\\' {
+            out.push(byte);
+            continue;
+        }
+        out.push(match rest.next()? {
+            b'n' => b'\n',
+            b'r' => b'\r',
+            b't' => b'\t',
+            b'a' => 7,
+            b'b' => 8,
+            b'v' => 11,
+            b'f' => 12,
+            b'x' => {
+                let digits = [rest.next()?, rest.next()?];
+                u8::from_str_radix(std::str::from_utf8(&digits).ok()?, 16).ok()?
+            }
+            same @ (b'\\' | b'\'' | b'"') => same,
+            _ => return None,
+        });
+    }
+    Some(out)
+}
+
+/// Text in `raw-unicode-escape`: Latin-1, with `\u` and `\U` for everything beyond.
+fn unescaped(line: &[u8]) -> Option<String> {
+    let mut out = String::with_capacity(line.len());
+    let mut at = 0;
+    while let Some(&byte) = line.get(at) {
+        at += 1;
+        let digits = match (byte, line.get(at)) {
+            (b'\\', Some(b'u')) => 4,
+            (b'\\', Some(b'U')) => 8,
+            _ => {
+                out.push(char::from(byte));
+                continue;
+            }
+        };
+        let code = |at: usize| {
+            let digits = std::str::from_utf8(line.get(at..at + digits)?).ok()?;
+            u32::from_str_radix(digits, 16).ok()
+        };
+        let mut character = code(at + 1)?;
+        at += 1 + digits;
+        // Python on Windows wrote what lies beyond 16 bits as two halves.
+        if (0xd800..0xdc00).contains(&character) && line.get(at..at + 2) == Some(b"\\u") {
+            let low = code(at + 2).filter(|low| (0xdc00..0xe000).contains(low))?;
+            character = 0x1_0000 + ((character - 0xd800) << 10) + (low - 0xdc00);
+            at += 6;
+        }
+        out.push(char::from_u32(character)?);
+    }
+    Some(out)
 }

@@ -11,6 +11,8 @@ mod tensor;
 
 pub use tensor::{Scalar, Storage, TensorView};
 
+use super::FormatError;
+use super::npy::{self, NpyArray};
 use machine::Machine;
 use std::sync::Arc;
 
@@ -21,6 +23,15 @@ pub struct PickleError {
     pub offset: usize,
     pub reason: String,
 }
+
+impl PickleError {
+    /// Whether the bytes end before the pickle does.
+    pub fn is_cut(&self) -> bool {
+        self.reason == CUT
+    }
+}
+
+const CUT: &str = "the pickle is cut short";
 
 /// An object of the arena.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -51,17 +62,66 @@ pub enum Node {
     Tensor(TensorView),
     /// A NumPy type such as `f8`.
     Dtype(String),
+    /// Each once, in the order of insertion.
+    Set(Vec<Id>),
+    /// Real and imaginary part.
+    Complex(f64, f64),
+    Array(ArrayView),
+    /// A tensor without strided values: what it is, in words.
+    Opaque(&'static str),
 }
+
+/// A NumPy array; its bytes are another node, so that nothing is copied.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ArrayView {
+    /// `f8`, `i4`, ...
+    pub dtype: String,
+    pub shape: Vec<usize>,
+    pub fortran: bool,
+    /// `None` for an array whose state has not come.
+    pub bytes: Option<Id>,
+}
+
 /// The global names that may appear.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Global {
-    OrderedDict,
+    /// `OrderedDict`, `Counter`, `dict`.
+    Dictionary,
+    /// A dictionary whose first argument makes missing values.
+    DefaultDict,
+    /// `list`, `tuple`, `set`, `frozenset`, `torch.Size`: all of them hold the items of one other container.
+    Container,
+    /// `bytes` and `bytearray`.
+    Bytes,
+    Complex,
+    /// `int`, `str`, ...: a plain type that stands for itself.
+    Type(&'static str),
     Namespace,
+    /// `copyreg._reconstructor`: an instance by its class.
+    Reconstruct,
     RebuildTensor,
-    RebuildParameter,
+    /// Of elements whose type is an argument of its own.
+    RebuildTyped,
+    /// By another function, whose result is given a type.
+    RebuildFromType,
+    /// A tensor that this product does not read: what it is, in words.
+    RebuildOther(&'static str),
+    /// `Parameter` and what rebuilds one.
+    Parameter,
+    /// A tensor that is empty until its state comes.
+    Tensor,
     StorageType(Scalar),
+    /// `torch.float32` and its kin.
+    TorchType(Scalar),
+    /// `torch.device`.
+    Device,
+    /// `torch.serialization._get_layout`: its name.
+    Layout,
     NumpyScalar,
     NumpyDtype,
+    NumpyArray,
+    NumpyReconstruct,
+    NumpyFromBuffer,
     Encode,
     /// `torch.jit._pickle.build_intlist` and its kin: the list itself.
     TypedList,
@@ -81,9 +141,13 @@ const MAX_BYTES: usize = 16 << 20;
 /// A training checkpoint of the largest released model has some twenty thousand objects.
 const MAX_NODES: usize = 1 << 19;
 const MAX_TEXT: usize = 1 << 20;
-/// Keys of storages, codes of NumPy types and the bytes of NumPy numbers: names can be called on the same text again and
-/// again, so what a call copies is short.
+/// Names and numbers of protocol 0.
+const MAX_LINE: usize = 1024;
+/// Keys of storages, codes of NumPy types and names of devices: names can be called on the same text again and again, so what
+/// a call copies is short.
 const MAX_COPIED: usize = 64;
+/// What all calls may copy together where it is long, as bytes that an old protocol wrote as text.
+const MAX_COPIES: usize = 16 << 20;
 /// Module and name of a global: a TorchScript class keeps both.
 const MAX_GLOBAL: usize = 256;
 
@@ -96,8 +160,34 @@ impl Pickle {
                 reason: format!("{} bytes; the limit is {MAX_BYTES}", bytes.len()),
             });
         }
-        let (nodes, root) = Machine::new(bytes).run()?;
-        Ok(Self { nodes, root })
+        Ok(Self::parse_first(bytes)?.0)
+    }
+
+    /// Reads the pickle that `bytes` begin with, whatever follows, and says how long it is.
+    pub fn parse_first(bytes: &[u8]) -> Result<(Self, usize), PickleError> {
+        let bytes = &bytes[..bytes.len().min(MAX_BYTES)];
+        let (nodes, root, end) = Machine::new(bytes).run()?;
+        Ok((Self { nodes, root }, end))
+    }
+
+    /// All objects, in the order in which they were made.
+    pub fn nodes(&self) -> &[Node] {
+        &self.nodes
+    }
+
+    /// A NumPy array with its values.
+    ///
+    /// # Errors
+    /// When it is none, or its elements are of a type that [`NpyArray`] cannot hold.
+    pub fn array(&self, id: Id) -> Result<NpyArray, FormatError> {
+        let wrong = |reason: &str| FormatError::malformed("pickle", 0, reason);
+        let Node::Array(view) = self.node(id) else {
+            return Err(wrong("not a NumPy array"));
+        };
+        match view.bytes.map(|bytes| self.node(bytes)) {
+            Some(Node::Bytes(bytes)) => npy::from_parts(&view.dtype, view.fortran, &view.shape, bytes),
+            _ => Err(wrong("a NumPy array without values")),
+        }
     }
 
     pub fn root(&self) -> Id {
@@ -186,7 +276,8 @@ mod tests {
             (b"ctorch.hub\nload\n.", "torch.hub.load"),
             (b"ctorch\nload\n.", "torch.load"),
             (b"ccollections\nOrderedDict.__init__\n.", "__init__"),
-            (b"(S'true'\nios\nsystem\n.", "opcode"),
+            (b"(S'true'\nios\nsystem\n.", "os.system"),
+            (b"(cos\nsystem\nS'true'\no.", "os.system"),
             (b"\x82\x01.", "opcode"),
         ] {
             let error = refused(bytes);

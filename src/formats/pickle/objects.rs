@@ -1,7 +1,15 @@
 //! What may be built: the allow-list of names, and what a call of each of them describes. Nothing is ever called.
 
 use super::machine::Machine;
-use super::{Global, Id, MAX_COPIED, MAX_GLOBAL, Node, PickleError, Scalar, Storage, TensorView};
+use super::{
+    ArrayView, Global, Id, MAX_COPIED, MAX_COPIES, MAX_GLOBAL, Node, PickleError, Scalar, Storage,
+    TensorView,
+};
+
+/// More than any function of the list has.
+const MAX_ARGUMENTS: usize = 16;
+/// A tensor whose state has not come.
+const EMPTY: &str = "a tensor without a state";
 
 impl Machine<'_> {
     /// The allow-list.
@@ -11,29 +19,70 @@ impl Machine<'_> {
             return self.refuse(format!("a global whose name has {length} bytes"));
         }
         Ok(match (module, name) {
-            ("collections", "OrderedDict") => Global::OrderedDict,
+            ("collections", "OrderedDict" | "Counter") => Global::Dictionary,
+            ("collections", "defaultdict") => Global::DefaultDict,
+            ("builtins" | "__builtin__", name) => match name {
+                "dict" => Global::Dictionary,
+                "list" | "tuple" | "set" | "frozenset" => Global::Container,
+                "bytes" | "bytearray" => Global::Bytes,
+                "complex" => Global::Complex,
+                "int" | "long" => Global::Type("int"),
+                "float" => Global::Type("float"),
+                "bool" => Global::Type("bool"),
+                "str" | "unicode" => Global::Type("str"),
+                "object" => Global::Type("object"),
+                _ => return self.forbidden(module, name),
+            },
+            ("copyreg" | "copy_reg", "_reconstructor") => Global::Reconstruct,
             ("argparse", "Namespace") => Global::Namespace,
-            ("torch._utils", "_rebuild_tensor_v2") => Global::RebuildTensor,
-            ("torch._utils", "_rebuild_parameter") => Global::RebuildParameter,
+            ("torch._utils", name) => match name {
+                "_rebuild_tensor" | "_rebuild_tensor_v2" | "_rebuild_qtensor" => {
+                    Global::RebuildTensor
+                }
+                "_rebuild_tensor_v3" => Global::RebuildTyped,
+                "_rebuild_parameter" | "_rebuild_parameter_with_state" => Global::Parameter,
+                "_rebuild_sparse_tensor" | "_rebuild_sparse_csr_tensor" => {
+                    Global::RebuildOther("a sparse tensor")
+                }
+                "_rebuild_meta_tensor_no_storage" => {
+                    Global::RebuildOther("a tensor without values (device `meta`)")
+                }
+                "_rebuild_nested_tensor" => Global::RebuildOther("a nested tensor"),
+                "_rebuild_wrapper_subclass" => Global::RebuildOther("a wrapped tensor"),
+                "_rebuild_device_tensor_from_numpy" | "_rebuild_device_tensor_from_cpu_tensor" => {
+                    Global::RebuildOther("a tensor of another device")
+                }
+                _ => return self.forbidden(module, name),
+            },
+            ("torch._tensor", "_rebuild_from_type_v2" | "_rebuild_from_type") => {
+                Global::RebuildFromType
+            }
+            ("torch.nn.parameter" | "torch.nn", "Parameter" | "Buffer") => Global::Parameter,
+            ("torch.serialization", "_get_layout") => Global::Layout,
             ("numpy.core.multiarray" | "numpy._core.multiarray", "scalar") => Global::NumpyScalar,
+            ("numpy.core.multiarray" | "numpy._core.multiarray", "_reconstruct") => {
+                Global::NumpyReconstruct
+            }
+            ("numpy.core.numeric" | "numpy._core.numeric", "_frombuffer") => {
+                Global::NumpyFromBuffer
+            }
             ("numpy", "dtype") => Global::NumpyDtype,
+            ("numpy", "ndarray") => Global::NumpyArray,
             ("_codecs", "encode") => Global::Encode,
             (
                 "torch.jit._pickle",
                 "build_intlist" | "build_doublelist" | "build_boollist" | "build_tensorlist",
-            ) => Global::TypedList,
-            ("torch", storage) => match storage {
-                "DoubleStorage" => Global::StorageType(Scalar::F64),
-                "FloatStorage" => Global::StorageType(Scalar::F32),
-                "HalfStorage" => Global::StorageType(Scalar::F16),
-                "BFloat16Storage" => Global::StorageType(Scalar::BF16),
-                "LongStorage" => Global::StorageType(Scalar::I64),
-                "IntStorage" => Global::StorageType(Scalar::I32),
-                "ShortStorage" => Global::StorageType(Scalar::I16),
-                "CharStorage" => Global::StorageType(Scalar::I8),
-                "ByteStorage" => Global::StorageType(Scalar::U8),
-                "BoolStorage" => Global::StorageType(Scalar::Bool),
-                _ => return self.forbidden(module, name),
+            ) => Global::Container,
+            ("torch" | "torch.cuda" | "torch.storage", name) => match name {
+                "Size" if module == "torch" => Global::Container,
+                "device" if module == "torch" => Global::Device,
+                "Tensor" if module == "torch" => Global::Tensor,
+                "UntypedStorage" => Global::StorageType(Scalar::U8),
+                name => match (Scalar::of_storage(name), Scalar::of_torch(name)) {
+                    (Some(scalar), _) => Global::StorageType(scalar),
+                    (None, Some(scalar)) if module == "torch" => Global::TorchType(scalar),
+                    _ => return self.forbidden(module, name),
+                },
             },
             (module, name) if module == "__torch__" || module.starts_with("__torch__.") => {
                 Global::Script(format!("{module}.{name}").into())
@@ -61,45 +110,172 @@ impl Machine<'_> {
         let Node::Tuple(arguments) = self.node(arguments) else {
             return self.refuse("a call whose arguments are not a tuple");
         };
-        if arguments.len() > 16 {
+        if arguments.len() > MAX_ARGUMENTS {
             return self.refuse(format!("a call with {} arguments", arguments.len()));
         }
         let arguments = arguments.clone();
         let Node::Global(function) = self.node(function).clone() else {
             return self.refuse("a call of something that is not a name");
         };
-        let node = match (function, arguments.as_slice()) {
-            (Global::OrderedDict, []) => Node::Dict(Vec::new()),
+        self.call(function, &arguments)
+    }
+
+    /// Pushes what a call of `function` would give.
+    fn call(&mut self, function: Global, arguments: &[Id]) -> Result<(), PickleError> {
+        let node = match (function, arguments) {
+            (Global::Dictionary | Global::DefaultDict, []) | (Global::DefaultDict, [_]) => {
+                Node::Dict(Vec::new())
+            }
+            (Global::Dictionary, [items]) | (Global::DefaultDict, [_, items]) => {
+                match self.node(*items) {
+                    Node::Dict(_) => return self.same(*items),
+                    Node::List(pairs) | Node::Tuple(pairs) => {
+                        let pairs = pairs.clone();
+                        self.dictionary(&pairs)?
+                    }
+                    _ => return self.refuse("a dictionary of something that is no list of pairs"),
+                }
+            }
+            (Global::Container, []) => Node::Tuple(Vec::new()),
+            (Global::Bytes, []) => Node::Bytes(Vec::new()),
+            (Global::Bytes, [text, codec]) | (Global::Encode, [text, codec]) => {
+                self.latin1(*text, *codec)?
+            }
+            (Global::Complex, [real, imaginary]) => {
+                Node::Complex(self.float(*real)?, self.float(*imaginary)?)
+            }
+            (Global::Parameter | Global::Container | Global::Bytes | Global::Layout, [same, ..]) => {
+                return self.same(*same);
+            }
+            (Global::Tensor, []) => Node::Opaque(EMPTY),
             (Global::RebuildTensor, [storage, offset, shape, strides, ..]) => {
-                Node::Tensor(self.tensor(*storage, *offset, *shape, *strides)?)
+                Node::Tensor(self.tensor(*storage, None, *offset, *shape, *strides)?)
             }
-            (Global::RebuildParameter, [tensor, ..]) | (Global::TypedList, [tensor]) => {
-                self.stack.push(*tensor);
-                return Ok(());
+            (Global::RebuildTyped, [storage, offset, shape, strides, _, _, dtype, ..]) => {
+                let Node::Global(Global::TorchType(scalar)) = *self.node(*dtype) else {
+                    return self.refuse("a tensor without the type of its elements");
+                };
+                Node::Tensor(self.tensor(*storage, Some(scalar), *offset, *shape, *strides)?)
             }
+            (Global::RebuildOther(what), _) => Node::Opaque(what),
+            (Global::RebuildFromType, [function, _, arguments, ..]) => {
+                let Node::Global(function) = self.node(*function).clone() else {
+                    return self.refuse("a tensor that is rebuilt by something that is not a name");
+                };
+                let arguments = match self.node(*arguments) {
+                    Node::Tuple(arguments) if arguments.len() <= MAX_ARGUMENTS => arguments.clone(),
+                    _ => return self.refuse("a tensor that is rebuilt from no tuple"),
+                };
+                // One level: a chain of them would call itself as often as the file likes.
+                if function == Global::RebuildFromType {
+                    return self.refuse("a tensor that is given a type twice");
+                }
+                return self.call(function, &arguments);
+            }
+            (Global::Reconstruct, [class, ..]) => {
+                let Node::Global(class) = self.node(*class).clone() else {
+                    return self.refuse("an instance of something that is not a name");
+                };
+                return self.construct(class, &[]);
+            }
+            (Global::Device, [name]) => match self.node(*name) {
+                Node::Text(name) => Node::Text(self.short(name)?),
+                _ => return self.refuse("a device without a name"),
+            },
+            (Global::Device, [name, index]) => match (self.node(*name), self.node(*index)) {
+                (Node::Text(name), Node::Int(index)) => {
+                    Node::Text(format!("{}:{index}", self.short(name)?))
+                }
+                _ => return self.refuse("a device without a name"),
+            },
             (Global::NumpyDtype, [code, ..]) => match self.node(*code) {
                 Node::Text(code) => Node::Dtype(self.short(code)?),
                 _ => return self.refuse("a NumPy type without a name"),
             },
             (Global::NumpyScalar, [dtype, bytes]) => self.numpy_scalar(*dtype, *bytes)?,
-            (Global::Encode, [text, codec]) => self.latin1(*text, *codec)?,
+            (Global::NumpyReconstruct, [class, ..])
+                if *self.node(*class) == Node::Global(Global::NumpyArray) =>
+            {
+                Node::Array(ArrayView {
+                    dtype: String::new(),
+                    shape: Vec::new(),
+                    fortran: false,
+                    bytes: None,
+                })
+            }
+            (Global::NumpyFromBuffer, [bytes, dtype, shape, order]) => {
+                let fortran = matches!(self.node(*order), Node::Text(order) if order == "F");
+                Node::Array(self.array_view(*dtype, *shape, fortran, *bytes)?)
+            }
             (function, _) => return self.refuse(format!("{function:?} called in an unknown way")),
         };
         self.push(node);
         Ok(())
     }
 
+    /// What a call gives is one of its arguments.
+    fn same(&mut self, id: Id) -> Result<(), PickleError> {
+        self.stack.push(id);
+        Ok(())
+    }
+
+    /// A dictionary of a list of pairs.
+    fn dictionary(&mut self, pairs: &[Id]) -> Result<Node, PickleError> {
+        self.copies(8 * pairs.len())?;
+        let pairs: Option<Vec<(Id, Id)>> = pairs
+            .iter()
+            .map(|&pair| match self.node(pair) {
+                Node::List(pair) | Node::Tuple(pair) => match pair[..] {
+                    [key, value] => Some((key, value)),
+                    _ => None,
+                },
+                _ => None,
+            })
+            .collect();
+        match pairs {
+            Some(pairs) => Ok(Node::Dict(pairs)),
+            None => self.refuse("a dictionary of something that is no pair"),
+        }
+    }
+
+    /// Counts what a call copies.
+    fn copies(&mut self, bytes: usize) -> Result<(), PickleError> {
+        self.copied = self.copied.saturating_add(bytes);
+        if self.copied > MAX_COPIES {
+            return self.refuse(format!("calls that copy more than {MAX_COPIES} bytes"));
+        }
+        Ok(())
+    }
+
+    fn float(&self, id: Id) -> Result<f64, PickleError> {
+        match self.node(id) {
+            Node::Float(value) => Ok(*value),
+            Node::Int(value) => Ok(*value as f64),
+            _ => self.refuse("a complex number of something that is no number"),
+        }
+    }
+
     pub(super) fn new_object(&mut self) -> Result<(), PickleError> {
         let (arguments, class) = (self.pop()?, self.pop()?);
-        let empty = matches!(self.node(arguments), Node::Tuple(items) if items.is_empty());
-        let class = match self.node(class) {
-            Node::Global(Global::Namespace) if empty => "argparse.Namespace".into(),
-            Node::Global(Global::Script(class)) if empty => class.clone(),
-            Node::Global(Global::OrderedDict) if empty => {
-                self.push(Node::Dict(Vec::new()));
-                return Ok(());
+        let arguments = match self.node(arguments) {
+            Node::Tuple(arguments) if arguments.len() <= MAX_ARGUMENTS => arguments.clone(),
+            _ => return self.refuse("an instance made from no tuple"),
+        };
+        let Node::Global(class) = self.node(class).clone() else {
+            return self.refuse("an instance of something that is not a plain record");
+        };
+        self.construct(class, &arguments)
+    }
+
+    /// Pushes an instance of `class`.
+    pub(super) fn construct(&mut self, class: Global, arguments: &[Id]) -> Result<(), PickleError> {
+        let class = match class {
+            Global::Namespace if arguments.is_empty() => "argparse.Namespace".into(),
+            Global::Script(class) if arguments.is_empty() => class,
+            Global::Namespace | Global::Script(_) => {
+                return self.refuse("an instance of something that is not a plain record");
             }
-            _ => return self.refuse("an instance of something that is not a plain record"),
+            class => return self.call(class, arguments),
         };
         self.push(Node::Object { class, state: None });
         Ok(())
@@ -111,8 +287,16 @@ impl Machine<'_> {
         let is_dict = matches!(self.node(given), Node::Dict(_));
         match &mut self.nodes[target.0 as usize] {
             Node::Object { state, .. } if is_dict => *state = Some(given),
-            // `OrderedDict._metadata` and the byte order of a NumPy type: not needed.
-            Node::Dict(_) if is_dict => {}
+            // `OrderedDict._metadata` and what somebody hung onto a parameter: not needed.
+            Node::Dict(_) | Node::Tensor(_) if is_dict => {}
+            Node::Array(_) => {
+                let view = self.array_state(given)?;
+                self.nodes[target.0 as usize] = Node::Array(view);
+            }
+            Node::Opaque(what) if *what == EMPTY => {
+                let view = self.tensor_state(given)?;
+                self.nodes[target.0 as usize] = Node::Tensor(view);
+            }
             Node::Dtype(_) => {
                 let Node::Tuple(state) = self.node(given) else {
                     return self.refuse("a NumPy type with an unknown state");
@@ -133,8 +317,13 @@ impl Machine<'_> {
         let Node::Tuple(parts) = self.node(id) else {
             return self.refuse("a persistent object that is not a tuple");
         };
-        let [kind, scalar, key, _, elements] = parts.as_slice() else {
-            return self.refuse("a persistent object with an unknown form");
+        let (kind, scalar, key, elements) = match parts.as_slice() {
+            [kind, scalar, key, _, elements] => (kind, scalar, key, elements),
+            // Files that are no archives also say of which storage this one is a part: of none, since torch 0.4.
+            [kind, scalar, key, _, elements, part] if *self.node(*part) == Node::None => {
+                (kind, scalar, key, elements)
+            }
+            _ => return self.refuse("a persistent object with an unknown form"),
         };
         let storage = match (
             self.node(*kind),
@@ -158,9 +347,56 @@ impl Machine<'_> {
         Ok(())
     }
 
+    /// The state of a tensor that was made empty: `(storage, offset, shape, strides)`.
+    fn tensor_state(&self, state: Id) -> Result<TensorView, PickleError> {
+        match self.node(state) {
+            Node::Tuple(parts) if parts.len() >= 4 => {
+                self.tensor(parts[0], None, parts[1], parts[2], parts[3])
+            }
+            _ => self.refuse("a tensor with an unknown state"),
+        }
+    }
+
+    /// The state of a NumPy array: `(version, shape, type, whether in Fortran order, bytes)`, without a version at first.
+    fn array_state(&self, state: Id) -> Result<ArrayView, PickleError> {
+        let (shape, dtype, fortran, bytes) = match self.node(state) {
+            Node::Tuple(parts) => match parts[..] {
+                [_, shape, dtype, fortran, bytes] | [shape, dtype, fortran, bytes] => {
+                    (shape, dtype, fortran, bytes)
+                }
+                _ => return self.refuse("a NumPy array with an unknown state"),
+            },
+            _ => return self.refuse("a NumPy array with an unknown state"),
+        };
+        let fortran = matches!(self.node(fortran), Node::Bool(true) | Node::Int(1));
+        self.array_view(dtype, shape, fortran, bytes)
+    }
+
+    fn array_view(
+        &self,
+        dtype: Id,
+        shape: Id,
+        fortran: bool,
+        bytes: Id,
+    ) -> Result<ArrayView, PickleError> {
+        let Node::Dtype(dtype) = self.node(dtype) else {
+            return self.refuse("a NumPy array without a type");
+        };
+        if !matches!(self.node(bytes), Node::Bytes(_)) {
+            return self.refuse(format!("a NumPy array of type `{dtype}` without bytes"));
+        }
+        Ok(ArrayView {
+            dtype: dtype.clone(),
+            shape: self.sizes(shape)?.into_iter().map(|d| d as usize).collect(),
+            fortran,
+            bytes: Some(bytes),
+        })
+    }
+
     fn tensor(
         &self,
         storage: Id,
+        scalar: Option<Scalar>,
         offset: Id,
         shape: Id,
         strides: Id,
@@ -168,6 +404,12 @@ impl Machine<'_> {
         let Node::Storage(storage) = self.node(storage) else {
             return self.refuse("a tensor without a storage");
         };
+        let mut storage = storage.clone();
+        if let Some(scalar) = scalar {
+            let bytes = storage.elements * storage.scalar.width() as u64;
+            storage.elements = bytes / scalar.width() as u64;
+            storage.scalar = scalar;
+        }
         let offset = self.size(offset)?;
         let shape = self.sizes(shape)?;
         let strides = self.sizes(strides)?;
@@ -177,7 +419,7 @@ impl Machine<'_> {
             ));
         }
         let view = TensorView {
-            storage: storage.clone(),
+            storage,
             offset,
             shape,
             strides,
@@ -197,7 +439,7 @@ impl Machine<'_> {
 
     fn sizes(&self, id: Id) -> Result<Vec<u64>, PickleError> {
         match self.node(id) {
-            Node::Tuple(items) if items.len() <= 8 => {
+            Node::Tuple(items) | Node::List(items) if items.len() <= 8 => {
                 items.iter().map(|&item| self.size(item)).collect()
             }
             _ => self.refuse("a shape that is not a tuple of at most 8 sizes"),
@@ -208,13 +450,22 @@ impl Machine<'_> {
         let (Node::Dtype(dtype), Node::Bytes(bytes)) = (self.node(dtype), self.node(bytes)) else {
             return self.refuse("a NumPy number with an unknown form");
         };
-        let node = match (dtype.as_str(), bytes.as_slice()) {
+        let width = bytes.len();
+        let signed = || long(bytes).map(Node::Int);
+        let node = match (dtype.trim_start_matches(['<', '|', '=']), bytes.as_slice()) {
             ("f8", &[a, b, c, d, e, f, g, h]) => {
                 Some(Node::Float(f64::from_le_bytes([a, b, c, d, e, f, g, h])))
             }
             ("f4", &[a, b, c, d]) => Some(Node::Float(f32::from_le_bytes([a, b, c, d]).into())),
-            ("i8", bytes) if bytes.len() == 8 => long(bytes).map(Node::Int),
-            ("i4", bytes) if bytes.len() == 4 => long(bytes).map(Node::Int),
+            ("f2", &[a, b]) => Some(Node::Float(half::f16::from_le_bytes([a, b]).into())),
+            ("i8", _) if width == 8 => signed(),
+            ("i4", _) if width == 4 => signed(),
+            ("i2", _) if width == 2 => signed(),
+            ("i1", _) if width == 1 => signed(),
+            ("u8", _) if width == 8 => unsigned(bytes),
+            ("u4", _) if width == 4 => unsigned(bytes),
+            ("u2", _) if width == 2 => unsigned(bytes),
+            ("u1", _) if width == 1 => unsigned(bytes),
             ("b1", &[value @ (0 | 1)]) => Some(Node::Bool(value == 1)),
             _ => None,
         };
@@ -225,17 +476,26 @@ impl Machine<'_> {
     }
 
     /// `_codecs.encode(text, "latin1")` is how old protocols write bytes.
-    fn latin1(&self, text: Id, codec: Id) -> Result<Node, PickleError> {
+    fn latin1(&mut self, text: Id, codec: Id) -> Result<Node, PickleError> {
         let (Node::Text(text), Node::Text(codec)) = (self.node(text), self.node(codec)) else {
             return self.refuse("bytes with an unknown form");
         };
-        let text = self.short(text)?;
-        let bytes: Option<Vec<u8>> = text.chars().map(|c| u8::try_from(c).ok()).collect();
-        match bytes {
-            Some(bytes) if codec == "latin1" => Ok(Node::Bytes(bytes)),
-            _ => self.refuse(format!("bytes in the encoding `{codec}`")),
+        if !matches!(codec.as_str(), "latin1" | "latin-1") {
+            return self.refuse(format!("bytes in the encoding `{}`", self.short(codec)?));
         }
+        let bytes: Option<Vec<u8>> = text.chars().map(|c| u8::try_from(c).ok()).collect();
+        let Some(bytes) = bytes else {
+            return self.refuse("bytes that are beyond Latin-1");
+        };
+        self.copies(bytes.len())?;
+        Ok(Node::Bytes(bytes))
     }
+}
+
+fn unsigned(bytes: &[u8]) -> Option<Node> {
+    let mut wide = [0; 16];
+    wide.get_mut(..bytes.len())?.copy_from_slice(bytes);
+    Some(Node::Int(i128::from_le_bytes(wide)))
 }
 
 /// A little-endian two's complement integer.

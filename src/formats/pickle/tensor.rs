@@ -7,38 +7,130 @@ pub enum Scalar {
     F32,
     F16,
     BF16,
+    /// Eight bits, four of them exponent.
+    F8E4M3,
+    /// Eight bits, five of them exponent.
+    F8E5M2,
+    /// Eight bits in a form that is not read: FNUZ, or exponent alone.
+    F8Other,
     I64,
     I32,
     I16,
     I8,
+    U64,
+    U32,
+    U16,
     U8,
     Bool,
+    C128,
+    C64,
+    C32,
+    /// Quantised: what the numbers mean stands beside them.
+    QI32,
+    QI8,
+    QU8,
 }
 
+/// Every type: width in bytes, our name, torch's, that of torch's storage, that of safetensors.
+type Row = (Scalar, usize, &'static str, &'static str, &'static str, &'static str);
+
+const TABLE: [Row; 22] = [
+    (Scalar::F64, 8, "f64", "float64", "DoubleStorage", "F64"),
+    (Scalar::F32, 4, "f32", "float32", "FloatStorage", "F32"),
+    (Scalar::F16, 2, "f16", "float16", "HalfStorage", "F16"),
+    (Scalar::BF16, 2, "bf16", "bfloat16", "BFloat16Storage", "BF16"),
+    (Scalar::F8E4M3, 1, "f8_e4m3", "float8_e4m3fn", "", "F8_E4M3"),
+    (Scalar::F8E5M2, 1, "f8_e5m2", "float8_e5m2", "", "F8_E5M2"),
+    (Scalar::F8Other, 1, "f8", "float8_e4m3fnuz", "", "F8_E8M0"),
+    (Scalar::I64, 8, "i64", "int64", "LongStorage", "I64"),
+    (Scalar::I32, 4, "i32", "int32", "IntStorage", "I32"),
+    (Scalar::I16, 2, "i16", "int16", "ShortStorage", "I16"),
+    (Scalar::I8, 1, "i8", "int8", "CharStorage", "I8"),
+    (Scalar::U64, 8, "u64", "uint64", "", "U64"),
+    (Scalar::U32, 4, "u32", "uint32", "", "U32"),
+    (Scalar::U16, 2, "u16", "uint16", "", "U16"),
+    (Scalar::U8, 1, "u8", "uint8", "ByteStorage", "U8"),
+    (Scalar::Bool, 1, "bool", "bool", "BoolStorage", "BOOL"),
+    (Scalar::C128, 16, "c128", "complex128", "ComplexDoubleStorage", "C128"),
+    (Scalar::C64, 8, "c64", "complex64", "ComplexFloatStorage", "C64"),
+    (Scalar::C32, 4, "c32", "complex32", "ComplexHalfStorage", "C32"),
+    (Scalar::QI32, 4, "qi32", "qint32", "QInt32Storage", "QI32"),
+    (Scalar::QI8, 1, "qi8", "qint8", "QInt8Storage", "QI8"),
+    (Scalar::QU8, 1, "qu8", "quint8", "QUInt8Storage", "QU8"),
+];
+
 impl Scalar {
+    fn row(self) -> &'static Row {
+        // In the order of the types.
+        &TABLE[self as usize]
+    }
+
     /// Bytes per element.
     pub fn width(self) -> usize {
-        match self {
-            Self::F64 | Self::I64 => 8,
-            Self::F32 | Self::I32 => 4,
-            Self::F16 | Self::BF16 | Self::I16 => 2,
-            Self::I8 | Self::U8 | Self::Bool => 1,
-        }
+        self.row().1
     }
 
     /// `f32`, `bf16`, `i64`, ...
     pub fn name(self) -> &'static str {
+        self.row().2
+    }
+
+    /// By the name of torch's storage: `FloatStorage`.
+    pub fn of_storage(name: &str) -> Option<Self> {
+        TABLE
+            .iter()
+            .find(|row| !name.is_empty() && row.4 == name)
+            .map(|row| row.0)
+    }
+
+    /// By the name of torch's type, without `torch.`: `float32`.
+    pub fn of_torch(name: &str) -> Option<Self> {
+        let name = match name {
+            "double" => "float64",
+            "float" => "float32",
+            "half" => "float16",
+            "long" => "int64",
+            "int" => "int32",
+            "short" => "int16",
+            "cdouble" => "complex128",
+            "cfloat" => "complex64",
+            "chalf" => "complex32",
+            "float8_e5m2fnuz" | "float8_e8m0fnu" => "float8_e4m3fnuz",
+            name => name,
+        };
+        TABLE.iter().find(|row| row.3 == name).map(|row| row.0)
+    }
+
+    /// By the name that safetensors uses: `F32`.
+    pub fn of_safetensors(name: &str) -> Option<Self> {
+        TABLE.iter().find(|row| row.5 == name).map(|row| row.0)
+    }
+
+    /// Torch's name with `torch.`.
+    pub fn torch(self) -> String {
+        format!("torch.{}", self.row().3)
+    }
+
+    /// Why values of this type are no real numbers that can be read; `None` where they are.
+    pub fn unreadable(self) -> Option<&'static str> {
         match self {
-            Self::F64 => "f64",
-            Self::F32 => "f32",
-            Self::F16 => "f16",
-            Self::BF16 => "bf16",
-            Self::I64 => "i64",
-            Self::I32 => "i32",
-            Self::I16 => "i16",
-            Self::I8 => "i8",
-            Self::U8 => "u8",
-            Self::Bool => "bool",
+            Self::C128 | Self::C64 | Self::C32 => Some("complex numbers"),
+            Self::QI32 | Self::QI8 | Self::QU8 => {
+                Some("quantised numbers, whose scale this product does not apply")
+            }
+            Self::F8Other => Some("eight-bit numbers in a form that this product does not know"),
+            _ => None,
+        }
+    }
+
+    /// The largest error of a number of at most one that was brought to this type, whether rounded or cut off.
+    pub fn precision(self) -> f32 {
+        match self {
+            Self::BF16 => 1.0 / 256.0,
+            Self::F16 => 1.0 / 2048.0,
+            Self::F8E4M3 => 1.0 / 16.0,
+            Self::F8E5M2 => 1.0 / 8.0,
+            _ => 0.0,
         }
     }
 
@@ -157,6 +249,14 @@ impl TensorView {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_table_of_types_is_in_their_order() {
+        for (index, row) in TABLE.iter().enumerate() {
+            assert_eq!(row.0 as usize, index, "{}", row.2);
+            assert_eq!(Scalar::of_torch(row.3), Some(row.0));
+        }
+    }
 
     fn view(offset: u64, shape: &[u64], strides: &[u64], elements: u64) -> Result<(), String> {
         TensorView {

@@ -65,8 +65,10 @@ impl End {
                 bytes[i..].starts_with(b"PK\x05\x06")
                     && i + 22 + usize::from(u16::from_le_bytes([bytes[i + 20], bytes[i + 21]]))
                         == bytes.len()
-            })
-            .ok_or_else(|| malformed(length, "not a zip archive: no end record"))?;
+            });
+        let Some(at) = at else {
+            return Err(malformed(length, without_end(reader)?));
+        };
         let start = length - tail + at as u64;
         let mut f = Fields::new(&bytes[at + 4..], start + 4);
         let (disk, directory_disk, here) = (f.u16()?, f.u16()?, f.u16()?);
@@ -119,6 +121,18 @@ impl End {
             count,
         })
     }
+}
+
+/// What an archive without its end record is.
+fn without_end<R: Read + Seek>(reader: &mut R) -> Result<&'static str, FormatError> {
+    let mut magic = Vec::new();
+    reader.seek(SeekFrom::Start(0))?;
+    reader.take(4).read_to_end(&mut magic)?;
+    Ok(if magic == b"PK\x03\x04" {
+        "the archive is cut off: its directory, which stands at the end, is missing"
+    } else {
+        "not a zip archive: no end record"
+    })
 }
 
 /// A directory record before its local header has been seen.

@@ -1,18 +1,23 @@
 //! The entries of any checkpoint file: names, types, shapes, shared memory; and their values, streamed.
 //!
-//! Three containers: torch's zip with a pickled dictionary (`.pth`), TorchScript archives (`.jit`, `.pt`: a tree of objects
-//! whose tensors get dotted names), and safetensors. Opening reads no tensor.
+//! Four containers: torch's zip with a pickled dictionary (`.pth`), what torch wrote before 1.6 (pickles, then the storages),
+//! TorchScript archives (`.jit`, `.pt`: a tree of objects whose tensors get dotted names), and safetensors. Opening reads no
+//! tensor.
 
 mod memory;
+mod legacy;
 mod safetensors;
+mod sniff;
 mod stream;
 mod torch;
+mod tree;
+mod wrappers;
 
 use super::ImportError;
 use crate::formats::pickle::{Scalar, TensorView};
 use crate::formats::zip::ZipArchive;
 use serde_json::{Map, Value};
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
 use std::io::{BufReader, Read, Seek};
 use std::path::{Path, PathBuf};
@@ -58,6 +63,10 @@ pub struct Checkpoint {
     arguments: Map<String, Value>,
     others: Vec<String>,
     source: Source,
+    /// What the tensors' names lie in, from outside to inside: keys of dictionaries, and wrappers in front of all names.
+    wrappers: Vec<String>,
+    /// Tensors that are no strided numbers: name, and what it is.
+    opaque: Vec<(String, &'static str)>,
     /// Archive members whose checksum has been verified.
     verified: BTreeSet<String>,
 }
@@ -72,27 +81,41 @@ enum Source {
         file: BufReader<File>,
         start: u64,
     },
+    /// Storages behind each other: where each begins.
+    Legacy {
+        file: BufReader<File>,
+        places: BTreeMap<String, u64>,
+    },
+}
+
+/// How a file is packed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Container {
+    Archive,
+    Legacy,
+    Safetensors,
 }
 
 impl Checkpoint {
     /// Opens a checkpoint and checks its structure; no tensor is read.
     pub fn open(path: &Path) -> Result<Self, ImportError> {
         let refused = |reason: String| ImportError::refused(path, reason);
+        let facts = std::fs::metadata(path).map_err(ImportError::io(path))?;
+        if !facts.is_file() {
+            return Err(refused("no regular file".to_owned()));
+        }
         let mut file = File::open(path).map_err(ImportError::io(path))?;
-        let mut magic = [0; 10];
-        let got = file.read(&mut magic).map_err(ImportError::io(path))?;
+        let mut head = Vec::new();
+        (&mut file)
+            .take(sniff::HEAD as u64)
+            .read_to_end(&mut head)
+            .map_err(ImportError::io(path))?;
         file.rewind().map_err(ImportError::io(path))?;
-        if magic.starts_with(b"PK\x03\x04") {
-            return Self::archive(path, file);
+        match sniff::container(&head, facts.len()).map_err(refused)? {
+            Container::Archive => Self::archive(path, file),
+            Container::Legacy => Self::legacy(path, file),
+            Container::Safetensors => Self::safetensors(path, file),
         }
-        if got == 10 && magic[8..10] == *b"{\"" {
-            return Self::safetensors(path, file);
-        }
-        Err(refused(if magic.starts_with(b"\x80\x02") {
-            "a torch file older than version 1.6; save it again with a newer torch".to_owned()
-        } else {
-            "neither a torch archive (`.pth`, `.pt`, `.jit`) nor a safetensors file".to_owned()
-        }))
     }
 
     pub fn path(&self) -> &Path {
@@ -116,6 +139,16 @@ impl Checkpoint {
     /// The index of an entry.
     pub fn find(&self, name: &str) -> Option<usize> {
         self.entries.iter().position(|entry| entry.name == name)
+    }
+
+    /// What was taken off around the names of the tensors, from outside to inside.
+    pub fn wrappers(&self) -> &[String] {
+        &self.wrappers
+    }
+
+    /// Tensors that cannot be read as numbers (sparse, without values, ...): their names, and what they are.
+    pub fn opaque(&self) -> &[(String, &'static str)] {
+        &self.opaque
     }
 
     /// What else lies at the top level of the file (`optimizer`, `epoch`, ...).

@@ -22,8 +22,12 @@ impl Checkpoint {
         file.read_exact(&mut prefix)
             .map_err(ImportError::io(path))?;
         let header = u64::from_le_bytes(prefix);
-        if header > (length - 8).min(MAX_HEADER) {
-            return Err(refused(format!("a header of {header} bytes")));
+        if header > length.saturating_sub(8).min(MAX_HEADER) {
+            return Err(refused(if header <= MAX_HEADER {
+                format!("cut off: a header of {header} bytes in a file of {length}")
+            } else {
+                format!("a header of {header} bytes")
+            }));
         }
         let mut text = vec![0; header as usize];
         file.read_exact(&mut text).map_err(ImportError::io(path))?;
@@ -32,8 +36,8 @@ impl Checkpoint {
         let available = length - 8 - header;
         let mut entries = Vec::new();
         for (name, entry) in parsed.iter().filter(|(name, _)| *name != "__metadata__") {
-            let view = view(entry, available)
-                .ok_or_else(|| refused(format!("the header's entry for `{name}` is not valid")))?;
+            let view =
+                view(entry, available).map_err(|reason| refused(format!("`{name}`: {reason}")))?;
             entries.push((name.clone(), view));
         }
         let entries = identify(entries, available).map_err(refused)?;
@@ -43,6 +47,8 @@ impl Checkpoint {
             entries,
             arguments: Map::new(),
             others: Vec::new(),
+            wrappers: Vec::new(),
+            opaque: Vec::new(),
             source: Source::Flat {
                 file,
                 start: 8 + header,
@@ -53,40 +59,45 @@ impl Checkpoint {
 }
 
 /// One entry of the header, checked against the `available` bytes behind it.
-fn view(entry: &Value, available: u64) -> Option<TensorView> {
-    let scalar = match entry["dtype"].as_str()? {
-        "F64" => Scalar::F64,
-        "F32" => Scalar::F32,
-        "F16" => Scalar::F16,
-        "BF16" => Scalar::BF16,
-        "I64" => Scalar::I64,
-        "I32" => Scalar::I32,
-        "I16" => Scalar::I16,
-        "I8" => Scalar::I8,
-        "U8" => Scalar::U8,
-        "BOOL" => Scalar::Bool,
-        _ => return None,
+fn view(entry: &Value, available: u64) -> Result<TensorView, String> {
+    const INVALID: &str = "its entry in the header is not valid";
+    let name = entry["dtype"].as_str().ok_or(INVALID)?;
+    let Some(scalar) = Scalar::of_safetensors(name) else {
+        let name: String = name.chars().take(40).collect();
+        return Err(format!("elements of type `{name}` are not read"));
     };
     let numbers = |value: &Value| -> Option<Vec<u64>> {
         value.as_array()?.iter().map(Value::as_u64).collect()
     };
-    let shape = numbers(&entry["shape"]).filter(|shape| shape.len() <= 8)?;
-    let offsets = numbers(&entry["data_offsets"])?;
+    let shape = numbers(&entry["shape"])
+        .filter(|shape| shape.len() <= 8)
+        .ok_or(INVALID)?;
+    let offsets = numbers(&entry["data_offsets"]).ok_or(INVALID)?;
     let [begin, end] = offsets[..] else {
-        return None;
+        return Err(INVALID.to_owned());
     };
     let width = scalar.width() as u64;
-    let elements = shape.iter().try_fold(1u64, |n, &d| n.checked_mul(d))?;
-    let fits = begin <= end
-        && end <= available
+    let elements = shape
+        .iter()
+        .try_fold(1u64, |n, &d| n.checked_mul(d))
+        .ok_or(INVALID)?;
+    let sound = begin <= end
         && elements.checked_mul(width) == Some(end - begin)
         && begin.is_multiple_of(width);
+    if !sound {
+        return Err(INVALID.to_owned());
+    }
+    if end > available {
+        return Err(format!(
+            "cut off: it lies in bytes {begin} to {end} behind the header, and there are {available}"
+        ));
+    }
     let mut strides = vec![1u64; shape.len()];
     for axis in (1..shape.len()).rev() {
         // Saturates only where there are no elements.
         strides[axis - 1] = strides[axis].saturating_mul(shape[axis].max(1));
     }
-    fits.then(|| TensorView {
+    Ok(TensorView {
         storage: Storage {
             key: String::new(),
             scalar,

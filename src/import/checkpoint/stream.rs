@@ -17,6 +17,13 @@ impl Checkpoint {
         sink: &mut dyn FnMut(&[f32]) -> Result<(), ImportError>,
     ) -> Result<(), ImportError> {
         let view = self.entries[index].view.clone();
+        if let Some(what) = view.storage.scalar.unreadable() {
+            let name = &self.entries[index].name;
+            return Err(ImportError::refused(
+                &self.path,
+                format!("`{name}` holds {what}"),
+            ));
+        }
         let width = view.storage.scalar.width();
         let mut floats = vec![0f32; CHUNK];
         let mut bytes = vec![0u8; CHUNK * width];
@@ -100,18 +107,30 @@ impl Checkpoint {
                     to_end: false,
                 })
             }
+            Source::Legacy { file, places } => {
+                let start = places.get(&view.storage.key).copied().unwrap_or(u64::MAX / 2);
+                file.seek(SeekFrom::Start(start + view.offset * width))
+                    .map_err(ImportError::io(path))?;
+                Ok(Bytes {
+                    path,
+                    source: Box::new(file),
+                    to_end: false,
+                })
+            }
             Source::Archive { zip, root } => {
                 let member = format!("{root}/data/{}", view.storage.key);
                 let size = zip.find(&member).map_or(0, |e| e.size);
                 let whole = view.offset == 0 && view.elements() * width == size;
                 if !whole && self.verified.insert(member.clone()) {
-                    let mut reader = zip.reader(&member)?;
+                    let mut reader = zip.reader(&member).map_err(|e| e.in_file(path))?;
                     std::io::copy(&mut reader, &mut std::io::sink())
                         .map_err(ImportError::io(path))?;
                 }
-                let mut reader = zip.reader(&member)?;
+                let mut reader = zip.reader(&member).map_err(|e| e.in_file(path))?;
                 if !whole {
-                    reader.skip_stored(view.offset * width)?;
+                    reader
+                        .skip_stored(view.offset * width)
+                        .map_err(|e| e.in_file(path))?;
                 }
                 Ok(Bytes {
                     path,
@@ -182,6 +201,54 @@ fn widen(bytes: &[u8], scalar: Scalar, out: &mut [f32]) {
         Scalar::I32 => each(bytes, out, |b| i32::from_le_bytes(b) as f32),
         Scalar::I16 => each(bytes, out, |b| f32::from(i16::from_le_bytes(b))),
         Scalar::I8 => each(bytes, out, |b: [u8; 1]| f32::from(b[0] as i8)),
+        Scalar::U64 => each(bytes, out, |b| u64::from_le_bytes(b) as f32),
+        Scalar::U32 => each(bytes, out, |b| u32::from_le_bytes(b) as f32),
+        Scalar::U16 => each(bytes, out, |b| f32::from(u16::from_le_bytes(b))),
         Scalar::U8 | Scalar::Bool => each(bytes, out, |b: [u8; 1]| f32::from(b[0])),
+        Scalar::F8E4M3 => each(bytes, out, |b: [u8; 1]| eight_bits(b[0], 3)),
+        Scalar::F8E5M2 => each(bytes, out, |b: [u8; 1]| eight_bits(b[0], 2)),
+        // Refused before anything is read.
+        Scalar::F8Other
+        | Scalar::C128
+        | Scalar::C64
+        | Scalar::C32
+        | Scalar::QI32
+        | Scalar::QI8
+        | Scalar::QU8 => out.fill(f32::NAN),
+    }
+}
+
+/// A number of eight bits, `mantissa` of them mantissa: E4M3 without infinity (two mantissas fewer), or E5M2 with it.
+fn eight_bits(byte: u8, mantissa: u32) -> f32 {
+    let exponent_bits = 7 - mantissa;
+    let bias = (1 << (exponent_bits - 1)) - 1;
+    let exponent = i32::from((byte & 0x7f) >> mantissa);
+    let fraction = f32::from(byte & ((1 << mantissa) - 1)) / f32::from(1u8 << mantissa);
+    let largest = (1 << exponent_bits) - 1;
+    let size = match exponent {
+        0 => fraction * f32::powi(2.0, 1 - bias),
+        _ if mantissa == 2 && exponent == largest && fraction == 0.0 => f32::INFINITY,
+        _ if mantissa == 2 && exponent == largest => f32::NAN,
+        _ if mantissa == 3 && byte & 0x7f == 0x7f => f32::NAN,
+        _ => (1.0 + fraction) * f32::powi(2.0, exponent - bias),
+    };
+    if byte & 0x80 == 0 { size } else { -size }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_of_eight_bits_are_those_of_torch() {
+        // torch 2.x: torch.tensor([..], dtype=torch.uint8).view(torch.float8_e4m3fn).float()
+        for (byte, value) in [(0x00, 0.0), (0x01, 0.001_953_125), (0x38, 1.0), (0xb9, -1.125), (0x7e, 448.0)] {
+            assert_eq!(eight_bits(byte, 3), value, "e4m3 {byte:#x}");
+        }
+        assert!(eight_bits(0x7f, 3).is_nan());
+        for (byte, value) in [(0x01, 1.525_878_9e-5), (0x3c, 1.0), (0xbd, -1.25), (0x7b, 57344.0), (0x7c, f32::INFINITY)] {
+            assert_eq!(eight_bits(byte, 2), value, "e5m2 {byte:#x}");
+        }
+        assert!(eight_bits(0x7d, 2).is_nan());
     }
 }

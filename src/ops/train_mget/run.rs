@@ -90,6 +90,19 @@ pub(super) struct Run {
     clips: Option<ClipFormat>,
 }
 
+/// What a manifest may say; what it says wrongly is no less there.
+fn stated<T: serde::de::DeserializeOwned>(
+    contents: &serde_json::Value,
+    key: &str,
+) -> Result<Option<T>, StageError> {
+    match contents.get(key) {
+        None | Some(serde_json::Value::Null) => Ok(None),
+        Some(value) => serde_json::from_value(value.clone())
+            .map(Some)
+            .map_err(|error| damaged(&format!("`{key}` of the manifest: {error}"))),
+    }
+}
+
 impl Run {
     pub(super) fn prepare(
         settings: &TrainMgetSettings,
@@ -103,7 +116,7 @@ impl Run {
         let facts: BTreeMap<String, TokenFacts> =
             serde_json::from_value(first.contents["tokens"].clone())
                 .map_err(|error| damaged(&format!("`tokens` of the manifest: {error}")))?;
-        let pixels = serde_json::from_value(first.contents[PIXELS].clone()).ok();
+        let pixels = stated(&first.contents, PIXELS)?;
         let spec = spec(settings, &facts, pixels);
         let masking =
             Masking::new(&settings.masking.settings, &spec.slots()).map_err(StageError::other)?;
@@ -159,7 +172,7 @@ impl Run {
             trainer.resume(&path).map_err(StageError::other)?;
             context.log(&format!("continues from step {step}"));
         }
-        let clips = serde_json::from_value(first.contents["format"].clone()).ok();
+        let clips = stated(&first.contents, "format")?;
         let tokenizers = Some(first.path.join(TOKENIZERS)).filter(|path| path.is_dir());
         Ok(Self {
             trainer,
