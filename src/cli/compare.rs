@@ -209,11 +209,7 @@ fn numbers(errors: &TrajectoryErrors) -> serde_json::Value {
 ///
 /// Stages of a run that score nothing of `columns` are left out, if another of its stages does: a table of depth has no row
 /// for scores of hands, which may be of other clips.
-pub fn entrants_of(
-    path: &Path,
-    runs: &Path,
-    columns: &[String],
-) -> Result<Vec<Method>, Failure> {
+pub fn entrants_of(path: &Path, runs: &Path, columns: &[String]) -> Result<Vec<Method>, Failure> {
     let read = |path: &Path| {
         Scores::read(path)
             .map_err(|error| Failure::input(error.to_string(), "was it written by `op: evaluate`?"))

@@ -150,8 +150,8 @@ impl Reconstruct {
         let runs = &self.place.runs;
         if let Some(given) = &self.model {
             if given.join("run.json").is_file() || !given.exists() {
-                let run = RunDirectory::named(runs, given)
-                    .map_err(|error| tell(terminal, &error))?;
+                let run =
+                    RunDirectory::named(runs, given).map_err(|error| tell(terminal, &error))?;
                 return model_of(&run).ok_or_else(|| {
                     Failure::input(
                         format!("run `{}` has no finished model of its own", run.name()),

@@ -84,7 +84,9 @@ impl Terminal {
     /// Prints what the command line itself has to say: help and version to stdout, mistakes to stderr.
     pub fn usage(&self, error: &clap::Error) -> ExitCode {
         match error.print() {
-            Err(failed) if !error.use_stderr() && failed.kind() != std::io::ErrorKind::BrokenPipe => {
+            Err(failed)
+                if !error.use_stderr() && failed.kind() != std::io::ErrorKind::BrokenPipe =>
+            {
                 self.lose(format!("stdout: {failed}"));
             }
             // A closed pipe is no reason to complain.

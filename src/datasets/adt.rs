@@ -206,10 +206,7 @@ struct AssociatedSkeleton {
 }
 
 /// The skeleton of the person who wears these glasses, or why there is none.
-fn skeleton_of(
-    folder: &Path,
-    serial: Option<&str>,
-) -> Result<Result<PathBuf, String>, ReadError> {
+fn skeleton_of(folder: &Path, serial: Option<&str>) -> Result<Result<PathBuf, String>, ReadError> {
     let path = folder.join("skeleton_aria_association.json");
     if !path.is_file() {
         return Ok(Err(

@@ -83,7 +83,10 @@ impl Tally {
         let dropped = dropped.map(|(reason, count)| format!("{count} clips dropped: {reason}"));
         let lost = self.lost.iter();
         let lost = lost.map(|(reason, count)| format!("{count} clips without {reason}"));
-        let damaged = self.damaged.iter().map(|error| format!("left out: {error}"));
+        let damaged = self
+            .damaged
+            .iter()
+            .map(|error| format!("left out: {error}"));
         dropped.chain(lost).chain(damaged).collect()
     }
 

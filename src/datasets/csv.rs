@@ -180,9 +180,14 @@ fn cells(line: &str, delimiter: u8) -> Vec<Range<usize>> {
     let (mut start, mut quoted) = (0, false);
     let mut push = |mut cell: Range<usize>| {
         let text = &line[cell.clone()];
-        cell.start += text.len() - text.trim_start_matches(crate::formats::text::is_space).len();
+        cell.start += text.len()
+            - text
+                .trim_start_matches(crate::formats::text::is_space)
+                .len();
         cell.end = cell.start + trim(text).len();
-        if cell.len() >= 2 && line[cell.clone()].starts_with('"') && line[cell.clone()].ends_with('"')
+        if cell.len() >= 2
+            && line[cell.clone()].starts_with('"')
+            && line[cell.clone()].ends_with('"')
         {
             cell = cell.start + 1..cell.end - 1;
         }
@@ -341,7 +346,10 @@ mod tests {
         };
         assert_eq!(found("a,b\n").unwrap(), None);
         assert_eq!(found("g_x,g_y,g_z\n").unwrap(), Some([0, 1, 2].map(Column)));
-        assert_eq!(found("g_z_w,g_y_w,g_x_w,g_x\n").unwrap(), Some([2, 1, 0].map(Column)));
+        assert_eq!(
+            found("g_z_w,g_y_w,g_x_w,g_x\n").unwrap(),
+            Some([2, 1, 0].map(Column))
+        );
         let error = found("g_x,g_z\n").unwrap_err();
         assert!(error.contains("no column `g_y`"), "{error}");
     }

@@ -204,7 +204,9 @@ fn take_hands(folder: &Path, stream: &str, recording: &mut Recording) -> Result<
         // Test participants come without ground truth.
         if !file.is_file() {
             let name = file.file_name().unwrap_or_default().to_string_lossy();
-            recording.lacks(format!("no left_hand and right_hand: `{name}` is not there"));
+            recording.lacks(format!(
+                "no left_hand and right_hand: `{name}` is not there"
+            ));
             return Ok(());
         }
     }
@@ -225,8 +227,9 @@ fn take_hands(folder: &Path, stream: &str, recording: &mut Recording) -> Result<
         if count > 0 {
             hands = hands.map(|hand| {
                 let samples = hand.times().iter().zip(hand.values());
-                let samples = samples
-                    .map(|(time, joints)| (*time, if failed(*time) { [None; 21] } else { *joints }));
+                let samples = samples.map(|(time, joints)| {
+                    (*time, if failed(*time) { [None; 21] } else { *joints })
+                });
                 Track::new(samples.collect(), SECOND / 10, SECOND / 50)
             });
             recording.lacks(

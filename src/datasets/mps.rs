@@ -66,7 +66,10 @@ fn first(folder: &Path, names: &[&str]) -> Option<PathBuf> {
 
 /// What to say where a file of the services is not there under any of its names.
 fn absent(what: &str, names: &[&str]) -> String {
-    format!("no {what}: `{}` is not there, in `mps` or beside it", names[0])
+    format!(
+        "no {what}: `{}` is not there, in `mps` or beside it",
+        names[0]
+    )
 }
 
 /// The recording itself: `video.vrs`, `recording.vrs`, or the only VRS file in the folder.
@@ -129,7 +132,8 @@ pub fn open(folder: &Path) -> Result<Recording, ReadError> {
             recording.colour = Some(Box::new(VrsColour { pictures }));
         }
     } else {
-        recording.lacks("no rgb: there is no VRS file, or several and none is called `recording.vrs`");
+        recording
+            .lacks("no rgb: there is no VRS file, or several and none is called `recording.vrs`");
     }
     if let Some(path) = first(folder, &CALIBRATIONS) {
         recording.cameras = calibration::online(&path, side)?
@@ -142,10 +146,15 @@ pub fn open(folder: &Path) -> Result<Recording, ReadError> {
         })?;
         recording.cameras = vec![(0, camera.into())];
     } else {
-        recording.lacks(absent("camera, gaze, hands in the camera and body", &CALIBRATIONS));
+        recording.lacks(absent(
+            "camera, gaze, hands in the camera and body",
+            &CALIBRATIONS,
+        ));
     }
     if recording.up_world.is_none() {
-        recording.lacks("the trajectory does not say where gravity points (columns `gravity_x_world`, ...)");
+        recording.lacks(
+            "the trajectory does not say where gravity points (columns `gravity_x_world`, ...)",
+        );
     }
     if let Some(path) = first(folder, &GAZES) {
         recording.gaze = Some(aria_gaze(&path, large_frame)?);

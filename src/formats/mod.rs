@@ -81,7 +81,11 @@ pub(crate) fn read_whole(path: &Path, limit: u64) -> Result<Vec<u8>, FormatError
         // Before it is opened: that of a pipe would wait for somebody who writes.
         let facts = std::fs::metadata(path)?;
         if !facts.is_file() {
-            let kind = if facts.is_dir() { "a folder" } else { "a pipe or a device" };
+            let kind = if facts.is_dir() {
+                "a folder"
+            } else {
+                "a pipe or a device"
+            };
             return Err(FormatError::NotAFile { kind });
         }
         let too_large = || FormatError::TooLarge { limit };

@@ -4,8 +4,8 @@
 //! [`Lines`] reads any length with bounded memory, [`read`] a small file at once. Text is UTF-8; UTF-16 is refused by its name,
 //! because its bytes would otherwise look like damage.
 
-use super::{FormatError, ReadError};
 use super::read_error::Position;
+use super::{FormatError, ReadError};
 use std::borrow::Cow;
 use std::fs::File;
 use std::io::{BufRead, BufReader};
@@ -294,7 +294,12 @@ mod tests {
     #[test]
     fn lines_end_as_on_any_machine() {
         let expected = ["a", "", "b", "c"].map(str::to_owned).to_vec();
-        for text in ["a\n\nb\nc\n", "a\r\n\r\nb\r\nc", "a\r\rb\rc\r", "\u{feff}a\n\n\u{feff}b\r\nc"] {
+        for text in [
+            "a\n\nb\nc\n",
+            "a\r\n\r\nb\r\nc",
+            "a\r\rb\rc\r",
+            "\u{feff}a\n\n\u{feff}b\r\nc",
+        ] {
             assert_eq!(lines(text.as_bytes()).unwrap(), expected, "{text:?}");
         }
         // A line end that lies across two buffers.
@@ -305,7 +310,11 @@ mod tests {
 
     #[test]
     fn utf_16_is_named() {
-        for text in [&b"\xff\xfea\0,\0b\0\n\0"[..], b"\xfe\xff\0a\0,\0b", b"a\0,\0b\0"] {
+        for text in [
+            &b"\xff\xfea\0,\0b\0\n\0"[..],
+            b"\xfe\xff\0a\0,\0b",
+            b"a\0,\0b\0",
+        ] {
             assert!(lines(text).unwrap_err().contains("UTF-16"), "{text:?}");
             assert!(decode(text.to_vec()).unwrap_err().contains("UTF-16"));
         }

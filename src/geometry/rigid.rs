@@ -140,10 +140,18 @@ mod tests {
         let transposed = std::array::from_fn(|k| good[4 * (k % 4) + k / 4]);
         assert_eq!(from_row_major(&transposed), Err(PoseError::Transposed));
         bad = good;
-        for v in bad.iter_mut().take(12).enumerate().filter(|(k, _)| k % 4 < 3).map(|(_, v)| v) {
+        for v in bad
+            .iter_mut()
+            .take(12)
+            .enumerate()
+            .filter(|(k, _)| k % 4 < 3)
+            .map(|(_, v)| v)
+        {
             *v *= 0.5;
         }
-        assert!(matches!(from_row_major(&bad), Err(PoseError::Scaled(s)) if (s - 0.5).abs() < 1e-9));
+        assert!(
+            matches!(from_row_major(&bad), Err(PoseError::Scaled(s)) if (s - 0.5).abs() < 1e-9)
+        );
         bad = good;
         bad[15] = 2.0;
         assert_eq!(from_row_major(&bad), Err(PoseError::NotAffine));

@@ -86,7 +86,9 @@ impl Source {
         let averages = self.checkpoint.others().iter();
         for name in averages.filter(|name| name.contains("ema")) {
             let path = self.path().display();
-            notices.push(format!("{path}: its averaged weights, `{name}`, are not used"));
+            notices.push(format!(
+                "{path}: its averaged weights, `{name}`, are not used"
+            ));
         }
         for (why, count) in left_out {
             let path = self.path().display();

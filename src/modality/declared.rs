@@ -122,7 +122,9 @@ impl DeclaredSettings {
             let name: String = self.name.chars().take(64).collect();
             return Some((
                 "name",
-                format!("`{name}` is no name of a modality: letters, digits, `_`, `-`, `.` and `@`, at most 64, no dot in front"),
+                format!(
+                    "`{name}` is no name of a modality: letters, digits, `_`, `-`, `.` and `@`, at most 64, no dot in front"
+                ),
             ));
         }
         if let Some(file) = &self.source.npz
@@ -130,7 +132,9 @@ impl DeclaredSettings {
         {
             return Some((
                 "source.npz",
-                format!("`{file}` is outside of the recording: a file of its folder is named, without `..`"),
+                format!(
+                    "`{file}` is outside of the recording: a file of its folder is named, without `..`"
+                ),
             ));
         }
         if !(signal.rate.is_finite() && signal.rate > 0.0 && signal.rate <= 10_000.0) {

@@ -32,8 +32,7 @@ const GRAVITY: [&str; 4] = [
     "g{}_world",
 ];
 /// What to say of a trajectory without it.
-pub const NO_GRAVITY: &str =
-    "no body: the trajectory does not say where gravity points (columns `gravity_x_world`, `gravity_y_world`, `gravity_z_world`)";
+pub const NO_GRAVITY: &str = "no body: the trajectory does not say where gravity points (columns `gravity_x_world`, `gravity_y_world`, `gravity_z_world`)";
 
 /// Rows kept as written.
 const FIRST_ROWS: usize = 4096;

@@ -48,8 +48,7 @@ impl Header {
             }
         }
         let descr = found.0.ok_or_else(|| wrong("`descr`"))?;
-        let (dtype, big_endian) =
-            dtype(descr).map_err(|reason| malformed(start as u64, reason))?;
+        let (dtype, big_endian) = dtype(descr).map_err(|reason| malformed(start as u64, reason))?;
         Ok(Self {
             dtype,
             big_endian,

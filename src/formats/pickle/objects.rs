@@ -144,7 +144,10 @@ impl Machine<'_> {
             (Global::Complex, [real, imaginary]) => {
                 Node::Complex(self.float(*real)?, self.float(*imaginary)?)
             }
-            (Global::Parameter | Global::Container | Global::Bytes | Global::Layout, [same, ..]) => {
+            (
+                Global::Parameter | Global::Container | Global::Bytes | Global::Layout,
+                [same, ..],
+            ) => {
                 return self.same(*same);
             }
             (Global::Tensor, []) => Node::Opaque(EMPTY),

@@ -32,13 +32,27 @@ pub enum Scalar {
 }
 
 /// Every type: width in bytes, our name, torch's, that of torch's storage, that of safetensors.
-type Row = (Scalar, usize, &'static str, &'static str, &'static str, &'static str);
+type Row = (
+    Scalar,
+    usize,
+    &'static str,
+    &'static str,
+    &'static str,
+    &'static str,
+);
 
 const TABLE: [Row; 22] = [
     (Scalar::F64, 8, "f64", "float64", "DoubleStorage", "F64"),
     (Scalar::F32, 4, "f32", "float32", "FloatStorage", "F32"),
     (Scalar::F16, 2, "f16", "float16", "HalfStorage", "F16"),
-    (Scalar::BF16, 2, "bf16", "bfloat16", "BFloat16Storage", "BF16"),
+    (
+        Scalar::BF16,
+        2,
+        "bf16",
+        "bfloat16",
+        "BFloat16Storage",
+        "BF16",
+    ),
     (Scalar::F8E4M3, 1, "f8_e4m3", "float8_e4m3fn", "", "F8_E4M3"),
     (Scalar::F8E5M2, 1, "f8_e5m2", "float8_e5m2", "", "F8_E5M2"),
     (Scalar::F8Other, 1, "f8", "float8_e4m3fnuz", "", "F8_E8M0"),
@@ -51,9 +65,30 @@ const TABLE: [Row; 22] = [
     (Scalar::U16, 2, "u16", "uint16", "", "U16"),
     (Scalar::U8, 1, "u8", "uint8", "ByteStorage", "U8"),
     (Scalar::Bool, 1, "bool", "bool", "BoolStorage", "BOOL"),
-    (Scalar::C128, 16, "c128", "complex128", "ComplexDoubleStorage", "C128"),
-    (Scalar::C64, 8, "c64", "complex64", "ComplexFloatStorage", "C64"),
-    (Scalar::C32, 4, "c32", "complex32", "ComplexHalfStorage", "C32"),
+    (
+        Scalar::C128,
+        16,
+        "c128",
+        "complex128",
+        "ComplexDoubleStorage",
+        "C128",
+    ),
+    (
+        Scalar::C64,
+        8,
+        "c64",
+        "complex64",
+        "ComplexFloatStorage",
+        "C64",
+    ),
+    (
+        Scalar::C32,
+        4,
+        "c32",
+        "complex32",
+        "ComplexHalfStorage",
+        "C32",
+    ),
     (Scalar::QI32, 4, "qi32", "qint32", "QInt32Storage", "QI32"),
     (Scalar::QI8, 1, "qi8", "qint8", "QInt8Storage", "QI8"),
     (Scalar::QU8, 1, "qu8", "quint8", "QUInt8Storage", "QU8"),

@@ -59,13 +59,11 @@ impl End {
         reader.seek(SeekFrom::Start(length - tail))?;
         let mut bytes = vec![0; tail as usize];
         reader.read_exact(&mut bytes)?;
-        let at = (0..bytes.len().saturating_sub(21))
-            .rev()
-            .find(|&i| {
-                bytes[i..].starts_with(b"PK\x05\x06")
-                    && i + 22 + usize::from(u16::from_le_bytes([bytes[i + 20], bytes[i + 21]]))
-                        == bytes.len()
-            });
+        let at = (0..bytes.len().saturating_sub(21)).rev().find(|&i| {
+            bytes[i..].starts_with(b"PK\x05\x06")
+                && i + 22 + usize::from(u16::from_le_bytes([bytes[i + 20], bytes[i + 21]]))
+                    == bytes.len()
+        });
         let Some(at) = at else {
             return Err(malformed(length, without_end(reader)?));
         };

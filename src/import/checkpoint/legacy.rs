@@ -51,7 +51,9 @@ impl Checkpoint {
         }
         let version = number(&next("its version")?);
         if version != Some(VERSION) {
-            return Err(refused(format!("version {version:?} of torch's old format is unknown")));
+            return Err(refused(format!(
+                "version {version:?} of torch's old format is unknown"
+            )));
         }
         let machine = next("what it says of the machine")?;
         let little = machine.get(machine.root(), "little_endian");
@@ -66,10 +68,15 @@ impl Checkpoint {
         let contents = tree::contents(&pickle).map_err(refused)?;
         let mut scalars: BTreeMap<&str, (Scalar, u64)> = BTreeMap::new();
         for node in pickle.nodes() {
-            let Node::Storage(storage) = node else { continue };
+            let Node::Storage(storage) = node else {
+                continue;
+            };
             let known = (storage.scalar, storage.elements);
             if *scalars.entry(&storage.key).or_insert(known) != known {
-                return Err(refused(format!("storage `{}` is described twice, differently", storage.key)));
+                return Err(refused(format!(
+                    "storage `{}` is described twice, differently",
+                    storage.key
+                )));
             }
         }
         let Node::List(keys_in_order) = keys.node(keys.root()) else {
@@ -91,7 +98,8 @@ impl Checkpoint {
                     "{CUT}: storage `{key}` needs {size} bytes from byte {start} on, and the file has {length}"
                 )));
             }
-            file.seek(SeekFrom::Start(place)).map_err(ImportError::io(path))?;
+            file.seek(SeekFrom::Start(place))
+                .map_err(ImportError::io(path))?;
             let mut count = [0; 8];
             file.read_exact(&mut count).map_err(ImportError::io(path))?;
             if u64::from_le_bytes(count) != elements {
@@ -107,7 +115,10 @@ impl Checkpoint {
         }
         for (name, view) in &contents.entries {
             if !places.contains_key(&view.storage.key) {
-                return Err(refused(format!("`{name}`: storage `{}` is missing", view.storage.key)));
+                return Err(refused(format!(
+                    "`{name}`: storage `{}` is missing",
+                    view.storage.key
+                )));
             }
         }
         let entries = identify(contents.entries, place - end).map_err(refused)?;

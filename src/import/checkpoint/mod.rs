@@ -4,8 +4,8 @@
 //! TorchScript archives (`.jit`, `.pt`: a tree of objects whose tensors get dotted names), and safetensors. Opening reads no
 //! tensor.
 
-mod memory;
 mod legacy;
+mod memory;
 mod safetensors;
 mod sniff;
 mod stream;

@@ -33,7 +33,11 @@ pub(super) fn container(head: &[u8], length: u64) -> Result<Container, String> {
         return Ok(Container::Safetensors);
     }
     // The length of a header that is not there any more.
-    if (1..=9).contains(&length) && head.get(4..).is_none_or(|rest| rest.iter().all(|&b| b == 0 || b == b'{')) {
+    if (1..=9).contains(&length)
+        && head
+            .get(4..)
+            .is_none_or(|rest| rest.iter().all(|&b| b == 0 || b == b'{'))
+    {
         return Err(format!("cut off after {length} bytes"));
     }
     Err("neither a torch file (`.pth`, `.pt`, `.jit`) nor a safetensors file".to_owned())
@@ -51,13 +55,18 @@ fn instead(head: &[u8]) -> Option<String> {
         format!("a {tool} pointer, not the weights it stands for: fetch them with `{command}`")
     };
     let packed = |tool: &str| format!("compressed with {tool}: unpack it first");
-    if begins("version https://git-lfs.github.com/spec") || begins("version https://hawser.github.com/spec") {
+    if begins("version https://git-lfs.github.com/spec")
+        || begins("version https://hawser.github.com/spec")
+    {
         return Some(pointer("Git LFS", "git lfs pull"));
     }
     if begins("# xet version") || begins("version https://xet.huggingface.co") {
         return Some(pointer("Xet", "git xet checkout"));
     }
-    if begins("/annex/objects/") || begins("../.git/annex/objects/") || begins(".git/annex/objects/") {
+    if begins("/annex/objects/")
+        || begins("../.git/annex/objects/")
+        || begins(".git/annex/objects/")
+    {
         return Some(pointer("git-annex", "git annex get"));
     }
     if begins("<!doctype html") || begins("<html") || begins("<head") || begins("<script") {
@@ -67,10 +76,15 @@ fn instead(head: &[u8]) -> Option<String> {
         );
     }
     if begins("<?xml") || begins("<error") {
-        return Some("XML text, not weights: perhaps the answer of a server that refused".to_owned());
+        return Some(
+            "XML text, not weights: perhaps the answer of a server that refused".to_owned(),
+        );
     }
     if begins("{") || begins("[") {
-        return Some("JSON text, not weights: perhaps the answer of a server, or an index of other files".to_owned());
+        return Some(
+            "JSON text, not weights: perhaps the answer of a server, or an index of other files"
+                .to_owned(),
+        );
     }
     if head.get(257..262) == Some(b"ustar") {
         // Torch before 0.1.10 wrote these.
@@ -94,7 +108,10 @@ fn instead(head: &[u8]) -> Option<String> {
         (b"\x89PNG", "a picture".to_owned()),
         (b"%PDF", "a PDF document".to_owned()),
         (b"\xff\xfe", "text in UTF-16".to_owned()),
-        (b"\0\x05\x16\x07", "what macOS stores beside a file that it copies (`._`), not the file".to_owned()),
+        (
+            b"\0\x05\x16\x07",
+            "what macOS stores beside a file that it copies (`._`), not the file".to_owned(),
+        ),
     ];
     magics
         .into_iter()
@@ -118,7 +135,10 @@ mod tests {
         legacy[..9].copy_from_slice(b"sys_info\0");
         let cases: [(&[u8], &str); 13] = [
             (b"", "empty"),
-            (b"version https://git-lfs.github.com/spec/v1\noid sha256:00\n", "Git LFS"),
+            (
+                b"version https://git-lfs.github.com/spec/v1\noid sha256:00\n",
+                "Git LFS",
+            ),
             (b"\xef\xbb\xbf\n <!DOCTYPE html><html>", "web page"),
             (b"<HTML><body>404</body>", "web page"),
             (b"<?xml version='1.0'?><Error>", "XML"),

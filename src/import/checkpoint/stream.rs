@@ -108,7 +108,10 @@ impl Checkpoint {
                 })
             }
             Source::Legacy { file, places } => {
-                let start = places.get(&view.storage.key).copied().unwrap_or(u64::MAX / 2);
+                let start = places
+                    .get(&view.storage.key)
+                    .copied()
+                    .unwrap_or(u64::MAX / 2);
                 file.seek(SeekFrom::Start(start + view.offset * width))
                     .map_err(ImportError::io(path))?;
                 Ok(Bytes {
@@ -242,11 +245,23 @@ mod tests {
     #[test]
     fn numbers_of_eight_bits_are_those_of_torch() {
         // torch 2.x: torch.tensor([..], dtype=torch.uint8).view(torch.float8_e4m3fn).float()
-        for (byte, value) in [(0x00, 0.0), (0x01, 0.001_953_125), (0x38, 1.0), (0xb9, -1.125), (0x7e, 448.0)] {
+        for (byte, value) in [
+            (0x00, 0.0),
+            (0x01, 0.001_953_125),
+            (0x38, 1.0),
+            (0xb9, -1.125),
+            (0x7e, 448.0),
+        ] {
             assert_eq!(eight_bits(byte, 3), value, "e4m3 {byte:#x}");
         }
         assert!(eight_bits(0x7f, 3).is_nan());
-        for (byte, value) in [(0x01, 1.525_878_9e-5), (0x3c, 1.0), (0xbd, -1.25), (0x7b, 57344.0), (0x7c, f32::INFINITY)] {
+        for (byte, value) in [
+            (0x01, 1.525_878_9e-5),
+            (0x3c, 1.0),
+            (0xbd, -1.25),
+            (0x7b, 57344.0),
+            (0x7c, f32::INFINITY),
+        ] {
             assert_eq!(eight_bits(byte, 2), value, "e5m2 {byte:#x}");
         }
         assert!(eight_bits(0x7d, 2).is_nan());

@@ -2,8 +2,8 @@
 
 use super::memory::identify;
 use super::{Checkpoint, Source, tree};
-use crate::formats::pickle::Pickle;
 use crate::formats::FormatError;
+use crate::formats::pickle::Pickle;
 use crate::formats::zip::{Method, ZipArchive};
 use crate::import::ImportError;
 use std::collections::{BTreeMap, BTreeSet};
@@ -39,7 +39,9 @@ impl Checkpoint {
         {
             return Err(refused("written on a big-endian machine".to_owned()));
         }
-        let bytes = zip.read(&format!("{root}/data.pkl"), 16 << 20).map_err(in_file)?;
+        let bytes = zip
+            .read(&format!("{root}/data.pkl"), 16 << 20)
+            .map_err(in_file)?;
         let pickle = Pickle::parse(&bytes).map_err(|e| refused(e.to_string()))?;
         drop(bytes);
         let contents = tree::contents(&pickle).map_err(refused)?;
@@ -83,4 +85,3 @@ impl Checkpoint {
         })
     }
 }
-

@@ -101,7 +101,9 @@ pub(super) fn contents(pickle: &Pickle) -> Result<Contents, String> {
             }
             Format::Torch
         }
-        Node::Tensor(_) => return Err("one tensor without a name, no checkpoint of a model".to_owned()),
+        Node::Tensor(_) => {
+            return Err("one tensor without a name, no checkpoint of a model".to_owned());
+        }
         _ => return Err("neither a dictionary nor a TorchScript module".to_owned()),
     };
     Ok(Contents {
@@ -227,7 +229,10 @@ impl Tree<'_> {
 
     fn opaque(&mut self, name: &str, what: &'static str) -> Result<(), String> {
         if name.len() > MAX_NAME || self.opaque.len() == MAX_ENTRIES {
-            return Err(format!("a tensor's name of {} bytes, or too many tensors", name.len()));
+            return Err(format!(
+                "a tensor's name of {} bytes, or too many tensors",
+                name.len()
+            ));
         }
         self.opaque.push((name.to_owned(), what));
         Ok(())

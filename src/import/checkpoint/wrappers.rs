@@ -50,7 +50,9 @@ impl Checkpoint {
             return false;
         };
         let counters: Vec<usize> = (0..short.len())
-            .filter(|&i| COUNTERS.contains(&short[i].as_str()) && self.entries[i].view.elements() == 1)
+            .filter(|&i| {
+                COUNTERS.contains(&short[i].as_str()) && self.entries[i].view.elements() == 1
+            })
             .collect();
         for (entry, name) in self.entries.iter_mut().zip(short) {
             entry.name = name;
@@ -60,7 +62,10 @@ impl Checkpoint {
             let counter = self.entries.remove(index);
             self.others.push(counter.name);
             for entry in &mut self.entries {
-                entry.same_as = entry.same_as.filter(|&of| of != index).map(|of| of - usize::from(of > index));
+                entry.same_as = entry
+                    .same_as
+                    .filter(|&of| of != index)
+                    .map(|of| of - usize::from(of > index));
             }
         }
         self.wrappers.extend(taken);
@@ -81,18 +86,28 @@ fn unwrapped(names: &[&str]) -> Option<(Vec<String>, Vec<String>)> {
     loop {
         let mut changed = false;
         for name in &mut parts {
-            while let Some(at) = name[..name.len() - 1].iter().position(|part| ANYWHERE.contains(part)) {
+            while let Some(at) = name[..name.len() - 1]
+                .iter()
+                .position(|part| ANYWHERE.contains(part))
+            {
                 note(name.remove(at));
                 changed = true;
             }
         }
-        let mut wrapped = parts.iter().filter(|name| !COUNTERS.contains(&name.join(".").as_str()));
-        let front = wrapped.next().and_then(|name| (name.len() > 1).then(|| name[0]));
+        let mut wrapped = parts
+            .iter()
+            .filter(|name| !COUNTERS.contains(&name.join(".").as_str()));
+        let front = wrapped
+            .next()
+            .and_then(|name| (name.len() > 1).then(|| name[0]));
         if let Some(front) = front.filter(|front| IN_FRONT.contains(front))
             && wrapped.all(|name| name.len() > 1 && name[0] == front)
         {
             note(front);
-            for name in parts.iter_mut().filter(|name| name.len() > 1 && name[0] == front) {
+            for name in parts
+                .iter_mut()
+                .filter(|name| name.len() > 1 && name[0] == front)
+            {
                 name.remove(0);
             }
             changed = true;
@@ -114,18 +129,36 @@ mod tests {
     fn wrappers_are_taken_off_in_any_order_and_depth() {
         for (names, short, taken) in [
             (["module.a.b", "module.c"], ["a.b", "c"], &["module."][..]),
-            (["_orig_mod.a.b", "_orig_mod.c"], ["a.b", "c"], &["_orig_mod."]),
+            (
+                ["_orig_mod.a.b", "_orig_mod.c"],
+                ["a.b", "c"],
+                &["_orig_mod."],
+            ),
             (
                 ["module._orig_mod.model.a.b", "module._orig_mod.model.c"],
                 ["a.b", "c"],
                 &["_orig_mod.", "module.", "model."],
             ),
-            (["state_dict.ema.a.b", "state_dict.ema.c"], ["a.b", "c"], &["state_dict.", "ema."]),
+            (
+                ["state_dict.ema.a.b", "state_dict.ema.c"],
+                ["a.b", "c"],
+                &["state_dict.", "ema."],
+            ),
             (["a._orig_mod.b", "c"], ["a.b", "c"], &["_orig_mod."]),
-            (["module.a.b", "n_averaged"], ["a.b", "n_averaged"], &["module."]),
+            (
+                ["module.a.b", "n_averaged"],
+                ["a.b", "n_averaged"],
+                &["module."],
+            ),
         ] {
             let (found, wrappers) = unwrapped(&names).unwrap();
-            assert_eq!((found, wrappers.as_slice()), (short.map(str::to_owned).to_vec(), &taken.iter().map(|t| (*t).to_owned()).collect::<Vec<_>>()[..]));
+            assert_eq!(
+                (found, wrappers.as_slice()),
+                (
+                    short.map(str::to_owned).to_vec(),
+                    &taken.iter().map(|t| (*t).to_owned()).collect::<Vec<_>>()[..]
+                )
+            );
         }
     }
 
