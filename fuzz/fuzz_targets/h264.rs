@@ -4,11 +4,14 @@
 use libfuzzer_sys::fuzz_target;
 use reviv::video::h264::Configuration;
 
-fuzz_target!(|parts: (Vec<u8>, Vec<u8>)| {
-    let (configuration, sample) = parts;
-    if let Ok(configuration) = Configuration::parse(&configuration) {
+fuzz_target!(|bytes: &[u8]| {
+    if let Ok(configuration) = Configuration::parse(bytes) {
         let _ = configuration.beyond_embedded();
-        let _ = configuration.is_disposable(&sample);
-        let _ = configuration.is_intra(&sample);
+        // Behind the parameter sets anything may follow; all of it is taken for a sample.
+        for start in [0, 8, 32, 64] {
+            let sample = bytes.get(start..).unwrap_or_default();
+            let _ = configuration.is_disposable(sample);
+            let _ = configuration.is_intra(sample);
+        }
     }
 });

@@ -16,6 +16,7 @@ use super::dataset::{Recordings, find};
 use super::recording::{ColourFrames, CutSettings, MountedCamera, Recording};
 use super::track::{ClockMap, SECOND, Track, nearest};
 use super::umetrack::{self, HandProfile};
+use crate::formats::is_plain_name;
 use crate::formats::read_error::Position;
 use crate::formats::text::read_json;
 use crate::geometry::camera::{Camera, Fisheye624, Lens};
@@ -75,7 +76,8 @@ pub fn headset(folder: &Path) -> Option<String> {
 /// When a file is missing that every recording has, or one is damaged.
 pub fn open(folder: &Path) -> Result<Recording, ReadError> {
     let metadata = metadata(folder)?;
-    let name = metadata.recording_name.unwrap_or_else(|| {
+    let name = metadata.recording_name.filter(|name| is_plain_name(name));
+    let name = name.unwrap_or_else(|| {
         folder.file_name().map_or_else(
             || "recording".into(),
             |name| name.to_string_lossy().into_owned(),

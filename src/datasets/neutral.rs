@@ -19,6 +19,7 @@ use super::dataset::{Recordings, find};
 use super::open::Frames;
 use super::recording::{CutSettings, GazeSample, JointFrame, MountedCamera, Recording};
 use super::track::SECOND;
+use crate::formats::is_plain_name;
 use crate::formats::read_error::Position;
 use crate::formats::text;
 use crate::video::image::Turn;
@@ -67,6 +68,19 @@ fn manifest(folder: &Path) -> Result<Manifest, ReadError> {
             &path,
             format!("format `{}` is not `{FORMAT}`", manifest.format),
         ));
+    }
+    // Both become names of folders where clips are written.
+    for (key, name) in [("source", &manifest.source), ("name", &manifest.name)] {
+        if let Some(name) = name
+            && !is_plain_name(name)
+        {
+            let name: String = name.chars().take(60).collect();
+            return Err(ReadError::malformed(
+                &path,
+                Position::File,
+                format!("`{key}: {name}` is no name of a folder"),
+            ));
+        }
     }
     Ok(manifest)
 }

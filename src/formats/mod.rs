@@ -112,6 +112,12 @@ pub(crate) fn stays_inside(path: &Path) -> bool {
     !path.as_os_str().is_empty() && path.components().all(plain)
 }
 
+/// Whether a text that a file gives can be the name of a file or a folder anywhere: one part, without separators of any system.
+pub(crate) fn is_plain_name(name: &str) -> bool {
+    let odd = |c: char| c.is_control() || matches!(c, '/' | '\\');
+    !matches!(name, "" | "." | "..") && name.len() <= 200 && !name.contains(odd)
+}
+
 /// A temporary file in `folder` that will be renamed, with the rights that a file made in place would have: the process's umask
 /// applies, where the default of `tempfile` would hide the file from colleagues.
 pub(crate) fn temporary_in(folder: &Path) -> std::io::Result<tempfile::NamedTempFile> {

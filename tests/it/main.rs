@@ -11,6 +11,7 @@ mod evaluation;
 mod full_disk;
 mod metrics;
 mod modality_plugin;
+mod odd_files;
 mod odd_videos;
 mod parity;
 mod readers_bad;
