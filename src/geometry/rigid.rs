@@ -20,7 +20,7 @@ pub enum PoseError {
     Transposed,
     #[error("the fourth row of the pose is not 0 0 0 1")]
     NotAffine,
-    #[error("the pose's rotation part is scaled by {0}: its columns must be of length one")]
+    #[error("the pose's rotation part is scaled by {0:.3}: its columns must be of length one")]
     Scaled(f64),
     #[error("the pose's rotation part is mirrored: one of its axes points the other way")]
     Mirrored,

@@ -206,19 +206,14 @@ impl Predictions {
         let path = directory.join(INDEX);
         let index = if path.is_file() {
             let text = std::fs::read_to_string(&path).map_err(PredictionsError::io(&path))?;
-            let index: PredictionsIndex = serde_json::from_str(&text)
+            let text = text.trim_start_matches('\u{feff}');
+            let index: PredictionsIndex = serde_json::from_str(text)
                 .map_err(|e| PredictionsError::content(&path, e.to_string()))?;
             if index.format != FORMAT {
                 let reason = format!("format {}, this program reads {FORMAT}", index.format);
                 return Err(PredictionsError::content(&path, reason));
             }
-            let outside = |file: &str| {
-                let file = Path::new(file);
-                file.is_absolute()
-                    || file
-                        .components()
-                        .any(|c| c == std::path::Component::ParentDir)
-            };
+            let outside = |file: &str| !crate::formats::stays_inside(Path::new(file));
             if let Some(clip) = index.clips.iter().find(|clip| outside(&clip.file)) {
                 let reason = format!("`{}` lies outside the folder", clip.file);
                 return Err(PredictionsError::content(&path, reason));

@@ -356,7 +356,11 @@ impl<'a> Machine<'a> {
     fn line_bytes(&mut self, longest: usize) -> Result<&'a [u8], PickleError> {
         let rest = &self.bytes[self.at..];
         let Some(end) = rest.iter().take(longest).position(|&b| b == b'\n') else {
-            return self.refuse("a line without an end");
+            return self.refuse(if rest.len() < longest {
+                CUT
+            } else {
+                "a line without an end"
+            });
         };
         self.at += end + 1;
         let line = &rest[..end];
