@@ -5,7 +5,9 @@
 //! stack, sharing through the memo cannot multiply memory, and the work is linear in the length of the file. An opcode or a
 //! global name outside the lists is an error that names it; nothing in the file is ever called.
 
+mod literal;
 mod machine;
+mod names;
 mod objects;
 mod tensor;
 
@@ -111,6 +113,8 @@ pub enum Global {
     /// A tensor that is empty until its state comes.
     Tensor,
     StorageType(Scalar),
+    /// Of numbers that share their bytes.
+    PackedStorage,
     /// `torch.float32` and its kin.
     TorchType(Scalar),
     /// `torch.device`.

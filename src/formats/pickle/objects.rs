@@ -1,102 +1,18 @@
-//! What may be built: the allow-list of names, and what a call of each of them describes. Nothing is ever called.
+//! What a call of each name of the allow-list describes. Nothing is ever called.
 
 use super::machine::Machine;
 use super::{
-    ArrayView, Global, Id, MAX_COPIED, MAX_COPIES, MAX_GLOBAL, Node, PickleError, Scalar, Storage,
-    TensorView,
+    ArrayView, Global, Id, MAX_COPIED, MAX_COPIES, Node, PickleError, Scalar, Storage, TensorView,
 };
 
 /// More than any function of the list has.
 const MAX_ARGUMENTS: usize = 16;
+/// A tensor of quantised numbers that share their bytes.
+const PACKED: &str = "a quantised tensor of several numbers to a byte";
 /// A tensor whose state has not come.
 const EMPTY: &str = "a tensor without a state";
 
 impl Machine<'_> {
-    /// The allow-list.
-    pub(super) fn global(&self, module: &str, name: &str) -> Result<Global, PickleError> {
-        let length = module.len() + name.len();
-        if length > MAX_GLOBAL {
-            return self.refuse(format!("a global whose name has {length} bytes"));
-        }
-        Ok(match (module, name) {
-            ("collections", "OrderedDict" | "Counter") => Global::Dictionary,
-            ("collections", "defaultdict") => Global::DefaultDict,
-            ("builtins" | "__builtin__", name) => match name {
-                "dict" => Global::Dictionary,
-                "list" | "tuple" | "set" | "frozenset" => Global::Container,
-                "bytes" | "bytearray" => Global::Bytes,
-                "complex" => Global::Complex,
-                "int" | "long" => Global::Type("int"),
-                "float" => Global::Type("float"),
-                "bool" => Global::Type("bool"),
-                "str" | "unicode" => Global::Type("str"),
-                "object" => Global::Type("object"),
-                _ => return self.forbidden(module, name),
-            },
-            ("copyreg" | "copy_reg", "_reconstructor") => Global::Reconstruct,
-            ("argparse", "Namespace") => Global::Namespace,
-            ("torch._utils", name) => match name {
-                "_rebuild_tensor" | "_rebuild_tensor_v2" | "_rebuild_qtensor" => {
-                    Global::RebuildTensor
-                }
-                "_rebuild_tensor_v3" => Global::RebuildTyped,
-                "_rebuild_parameter" | "_rebuild_parameter_with_state" => Global::Parameter,
-                "_rebuild_sparse_tensor" | "_rebuild_sparse_csr_tensor" => {
-                    Global::RebuildOther("a sparse tensor")
-                }
-                "_rebuild_meta_tensor_no_storage" => {
-                    Global::RebuildOther("a tensor without values (device `meta`)")
-                }
-                "_rebuild_nested_tensor" => Global::RebuildOther("a nested tensor"),
-                "_rebuild_wrapper_subclass" => Global::RebuildOther("a wrapped tensor"),
-                "_rebuild_device_tensor_from_numpy" | "_rebuild_device_tensor_from_cpu_tensor" => {
-                    Global::RebuildOther("a tensor of another device")
-                }
-                _ => return self.forbidden(module, name),
-            },
-            ("torch._tensor", "_rebuild_from_type_v2" | "_rebuild_from_type") => {
-                Global::RebuildFromType
-            }
-            ("torch.nn.parameter" | "torch.nn", "Parameter" | "Buffer") => Global::Parameter,
-            ("torch.serialization", "_get_layout") => Global::Layout,
-            ("numpy.core.multiarray" | "numpy._core.multiarray", "scalar") => Global::NumpyScalar,
-            ("numpy.core.multiarray" | "numpy._core.multiarray", "_reconstruct") => {
-                Global::NumpyReconstruct
-            }
-            ("numpy.core.numeric" | "numpy._core.numeric", "_frombuffer") => {
-                Global::NumpyFromBuffer
-            }
-            ("numpy", "dtype") => Global::NumpyDtype,
-            ("numpy", "ndarray") => Global::NumpyArray,
-            ("_codecs", "encode") => Global::Encode,
-            (
-                "torch.jit._pickle",
-                "build_intlist" | "build_doublelist" | "build_boollist" | "build_tensorlist",
-            ) => Global::Container,
-            ("torch" | "torch.cuda" | "torch.storage", name) => match name {
-                "Size" if module == "torch" => Global::Container,
-                "device" if module == "torch" => Global::Device,
-                "Tensor" if module == "torch" => Global::Tensor,
-                "UntypedStorage" => Global::StorageType(Scalar::U8),
-                name => match (Scalar::of_storage(name), Scalar::of_torch(name)) {
-                    (Some(scalar), _) => Global::StorageType(scalar),
-                    (None, Some(scalar)) if module == "torch" => Global::TorchType(scalar),
-                    _ => return self.forbidden(module, name),
-                },
-            },
-            (module, name) if module == "__torch__" || module.starts_with("__torch__.") => {
-                Global::Script(format!("{module}.{name}").into())
-            }
-            _ => return self.forbidden(module, name),
-        })
-    }
-
-    fn forbidden<T>(&self, module: &str, name: &str) -> Result<T, PickleError> {
-        self.refuse(format!(
-            "it wants to call `{module}.{name}`, which no checkpoint of a model needs; nothing was executed"
-        ))
-    }
-
     /// A text that a call copies.
     fn short(&self, text: &str) -> Result<String, PickleError> {
         if text.len() > MAX_COPIED {
@@ -151,6 +67,11 @@ impl Machine<'_> {
                 return self.same(*same);
             }
             (Global::Tensor, []) => Node::Opaque(EMPTY),
+            (Global::RebuildTensor, [storage, ..])
+                if matches!(self.node(*storage), Node::Opaque(_)) =>
+            {
+                Node::Opaque(PACKED)
+            }
             (Global::RebuildTensor, [storage, offset, shape, strides, ..]) => {
                 Node::Tensor(self.tensor(*storage, None, *offset, *shape, *strides)?)
             }
@@ -328,6 +249,10 @@ impl Machine<'_> {
             }
             _ => return self.refuse("a persistent object with an unknown form"),
         };
+        if *self.node(*scalar) == Node::Global(Global::PackedStorage) {
+            self.push(Node::Opaque(PACKED));
+            return Ok(());
+        }
         let storage = match (
             self.node(*kind),
             self.node(*scalar),
