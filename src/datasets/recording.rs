@@ -324,7 +324,7 @@ impl Recording {
             lost.extend(reason.map(|reason| format!("body: {reason}")));
         }
         if camera.is_none() && self.hands_frame == JointFrame::World {
-            for (hand, name) in self.hands.iter().zip([LEFT_HAND, RIGHT_HAND]) {
+            for (hand, name) in self.hands.iter().zip(["left_hand", "right_hand"]) {
                 if hand.is_some() {
                     lost.push(format!("{name}: the recording has no camera poses"));
                 }
