@@ -192,8 +192,9 @@ impl<'a> Composer<'a> {
                 });
                 match yaml::decode(&bytes, layer) {
                     Ok(text) => {
-                        self.sources.set_text(layer, text.to_owned());
-                        Some((layer, text.to_owned()))
+                        let text = text.into_owned();
+                        self.sources.set_text(layer, text.clone());
+                        Some((layer, text))
                     }
                     Err(diagnostic) => {
                         self.diagnostics.push(*diagnostic);

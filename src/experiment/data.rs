@@ -108,13 +108,13 @@ fn file(
 ) -> BTreeMap<String, String> {
     let mut roots = BTreeMap::new();
     let text = match yaml::decode(bytes, layer) {
-        Ok(text) => text,
+        Ok(text) => text.into_owned(),
         Err(diagnostic) => {
             diagnostics.push(*diagnostic);
             return roots;
         }
     };
-    sources.set_text(layer, text.to_owned());
+    sources.set_text(layer, text.clone());
     if text.lines().all(|line| {
         let line = line.trim();
         line.is_empty() || line.starts_with('#')

@@ -278,7 +278,7 @@ pub fn canonical(path: &Path) -> PathBuf {
 pub fn read(path: &Path) -> std::io::Result<String> {
     let bytes = read_bytes(path)?;
     yaml::decode(&bytes, 0)
-        .map(str::to_owned)
+        .map(std::borrow::Cow::into_owned)
         .map_err(|diagnostic| std::io::Error::other(diagnostic.message))
 }
 

@@ -18,6 +18,9 @@ impl Source {
     /// Opens a file and finds out what it is; no tensor is read.
     pub fn open(path: &Path, options: &ImportOptions) -> Result<Self, ImportError> {
         let mut checkpoint = Checkpoint::open(path)?;
+        if let Some(reason) = checkpoint.overlap() {
+            return Err(ImportError::refused(path, reason));
+        }
         if !known(&checkpoint) || checkpoint.has_wrapped_layers() {
             checkpoint.unwrap_names();
         }

@@ -3,12 +3,14 @@
 use super::{Data, MAX_BYTES};
 use crate::experiment::diagnostic::{Diagnostic, Span};
 use crate::experiment::problem::Code;
+use crate::formats::text;
+use std::borrow::Cow;
 
 /// Reads bytes as text: size, encoding.
 ///
 /// # Errors
 /// One diagnostic that says what the file is instead.
-pub fn decode(bytes: &[u8], layer: u32) -> Result<&str, Box<Diagnostic>> {
+pub fn decode(bytes: &[u8], layer: u32) -> Result<Cow<'_, str>, Box<Diagnostic>> {
     let start = Span::point(layer, 0);
     if bytes.len() > MAX_BYTES {
         return Err(Box::new(
@@ -22,6 +24,10 @@ pub fn decode(bytes: &[u8], layer: u32) -> Result<&str, Box<Diagnostic>> {
             )
             .help("data does not belong in an experiment: name a file or a data set"),
         ));
+    }
+    if bytes.starts_with(b"\xff\xfe") || bytes.starts_with(b"\xfe\xff") {
+        let diagnostic = Diagnostic::new(Code::E0101, start, "the file is UTF-16, not UTF-8");
+        return Err(Box::new(diagnostic.help("save it as UTF-8")));
     }
     let text = std::str::from_utf8(bytes).map_err(|error| {
         Box::new(
@@ -46,7 +52,7 @@ pub fn decode(bytes: &[u8], layer: u32) -> Result<&str, Box<Diagnostic>> {
             .help("name a YAML file"),
         ));
     }
-    Ok(text)
+    Ok(text::yaml(text))
 }
 
 /// A plain scalar by the YAML 1.2 core schema.

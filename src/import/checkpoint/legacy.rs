@@ -121,7 +121,7 @@ impl Checkpoint {
                 )));
             }
         }
-        let entries = identify(contents.entries, place - end).map_err(refused)?;
+        let (entries, overlap) = identify(contents.entries, place - end).map_err(refused)?;
         Ok(Self {
             path: path.to_owned(),
             format: contents.format,
@@ -131,6 +131,7 @@ impl Checkpoint {
             wrappers: contents.wrappers,
             opaque: contents.opaque,
             source: Source::Legacy { file, places },
+            overlap,
             verified: BTreeSet::new(),
         })
     }

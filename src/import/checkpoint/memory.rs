@@ -12,11 +12,12 @@ pub(super) const MAX_NAME: usize = 512;
 /// Storage, type of the elements, offset, shape and strides of a view.
 type Place = (String, Scalar, u64, Vec<u64>, Vec<u64>);
 
-/// Marks entries that are the same view, and refuses tensors that overlap otherwise.
+/// Entries, those that are the same view marked, and what overlaps otherwise: a file may be looked at all the same, but what would
+/// be written of it could be much larger than the file.
 pub(super) fn identify(
     tensors: Vec<(String, TensorView)>,
     memory: u64,
-) -> Result<Vec<Entry>, String> {
+) -> Result<(Vec<Entry>, Option<String>), String> {
     let mut names = BTreeSet::new();
     let mut owners: BTreeMap<Place, usize> = BTreeMap::new();
     let mut entries = Vec::with_capacity(tensors.len());
@@ -47,9 +48,8 @@ pub(super) fn identify(
         entries.push(entry);
     }
     if claimed > memory {
-        return Err(format!(
-            "the tensors overlap: they claim {claimed} bytes of {memory}"
-        ));
+        let reason = format!("the tensors overlap: they claim {claimed} bytes of {memory}");
+        return Ok((entries, Some(reason)));
     }
     // In bytes: views of one storage may have elements of different sizes.
     let mut spans: Vec<(&str, u64, u64, &str)> = entries
@@ -67,10 +67,11 @@ pub(super) fn identify(
         let (first, second) = (pair[0], pair[1]);
         let same = (first.1, first.2) == (second.1, second.2);
         if first.0 == second.0 && second.1 < first.2 && !same {
-            return Err(format!("`{}` and `{}` overlap", first.3, second.3));
+            let reason = format!("`{}` and `{}` overlap", first.3, second.3);
+            return Ok((entries, Some(reason)));
         }
     }
-    Ok(entries)
+    Ok((entries, None))
 }
 
 #[cfg(test)]
@@ -100,16 +101,19 @@ mod tests {
             line("mean", Scalar::F32, 0, 8),
             line("step", Scalar::I64, 4, 1),
         ];
-        let entries = identify(apart, 64).unwrap();
+        let (entries, _) = identify(apart, 64).unwrap();
         assert!(entries.iter().all(|e| e.same_as.is_none()));
         // Bytes 16..20 and 32..40: in elements both 4..5.
         let alike = vec![line("a", Scalar::F32, 4, 1), line("b", Scalar::I64, 4, 1)];
-        assert_eq!(identify(alike, 64).unwrap()[1].same_as, None);
+        assert_eq!(identify(alike, 64).unwrap().0[1].same_as, None);
         // Bytes 0..36 and 32..40: in elements 0..9 and 4..5.
         let over = vec![line("a", Scalar::F32, 0, 9), line("b", Scalar::I64, 4, 1)];
-        assert_eq!(identify(over, 64).unwrap_err(), "`a` and `b` overlap");
+        assert_eq!(
+            identify(over, 64).unwrap().1.as_deref(),
+            Some("`a` and `b` overlap")
+        );
         let same = vec![line("a", Scalar::F32, 4, 1), line("b", Scalar::F32, 4, 1)];
-        assert_eq!(identify(same, 64).unwrap()[1].same_as, Some(0));
+        assert_eq!(identify(same, 64).unwrap().0[1].same_as, Some(0));
     }
 
     #[test]
@@ -118,7 +122,7 @@ mod tests {
         empty.1.shape = vec![0, 1 << 40, 1 << 40];
         empty.1.strides = vec![1, 1 << 40, 1];
         assert!(empty.1.is_contiguous());
-        let entries = identify(vec![empty, line("a", Scalar::F32, 0, 16)], 64).unwrap();
+        let (entries, _) = identify(vec![empty, line("a", Scalar::F32, 0, 16)], 64).unwrap();
         assert_eq!(entries[1].same_as, None);
     }
 }

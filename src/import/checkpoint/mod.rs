@@ -67,6 +67,8 @@ pub struct Checkpoint {
     wrappers: Vec<String>,
     /// Tensors that are no strided numbers: name, and what it is.
     opaque: Vec<(String, &'static str)>,
+    /// Why the tensors are not apart, where they are not.
+    overlap: Option<String>,
     /// Archive members whose checksum has been verified.
     verified: BTreeSet<String>,
 }
@@ -144,6 +146,11 @@ impl Checkpoint {
     /// What was taken off around the names of the tensors, from outside to inside.
     pub fn wrappers(&self) -> &[String] {
         &self.wrappers
+    }
+
+    /// Which tensors share memory without being the same; such a file can be looked at, not imported.
+    pub fn overlap(&self) -> Option<&str> {
+        self.overlap.as_deref()
     }
 
     /// Tensors that cannot be read as numbers (sparse, without values, ...): their names, and what they are.

@@ -40,7 +40,11 @@ impl Checkpoint {
                 view(entry, available).map_err(|reason| refused(format!("`{name}`: {reason}")))?;
             entries.push((name.clone(), view));
         }
-        let entries = identify(entries, available).map_err(refused)?;
+        let (entries, overlap) = identify(entries, available).map_err(refused)?;
+        // Its own rule, where torch has none.
+        if let Some(reason) = overlap {
+            return Err(refused(reason));
+        }
         Ok(Self {
             path: path.to_owned(),
             format: Format::Safetensors,
@@ -53,6 +57,7 @@ impl Checkpoint {
                 file,
                 start: 8 + header,
             },
+            overlap: None,
             verified: BTreeSet::new(),
         })
     }

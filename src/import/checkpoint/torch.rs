@@ -68,7 +68,7 @@ impl Checkpoint {
             }
             sizes.insert(storage.key.clone(), member.size);
         }
-        let entries = identify(entries, sizes.values().sum()).map_err(refused)?;
+        let (entries, overlap) = identify(entries, sizes.values().sum()).map_err(refused)?;
         Ok(Self {
             path: path.to_owned(),
             format: contents.format,
@@ -81,6 +81,7 @@ impl Checkpoint {
                 zip: Box::new(zip),
                 root,
             },
+            overlap,
             verified: BTreeSet::new(),
         })
     }

@@ -101,8 +101,21 @@ pub(super) fn contents(pickle: &Pickle) -> Result<Contents, String> {
             }
             Format::Torch
         }
-        Node::Tensor(_) => {
-            return Err("one tensor without a name, no checkpoint of a model".to_owned());
+        // Without names: one tensor, or several in their order.
+        Node::Tensor(view) => {
+            tree.push("tensor", view)?;
+            Format::Torch
+        }
+        Node::List(items) | Node::Tuple(items) => {
+            for (index, item) in items.iter().enumerate() {
+                if let Node::Tensor(view) = pickle.node(*item) {
+                    tree.push(&index.to_string(), view)?;
+                }
+            }
+            if tree.entries.is_empty() {
+                return Err("it holds no dictionary of tensors".to_owned());
+            }
+            Format::Torch
         }
         _ => return Err("neither a dictionary nor a TorchScript module".to_owned()),
     };
