@@ -121,7 +121,7 @@ fn file(
     }) {
         return roots;
     }
-    let Some(node) = yaml::parse(text, layer, diagnostics) else {
+    let Some(node) = yaml::parse(&text, layer, diagnostics) else {
         return roots;
     };
     if !matches!(node.data, yaml::Data::Map(_)) {
