@@ -31,6 +31,8 @@ const MAX_GAP: i64 = SECOND / 25;
 const HOLD: i64 = SECOND / 100;
 /// Ticks of 100 ns in a second.
 const TICKS: f64 = 1e7;
+/// A row this far before the first picture or after the last, in ticks, still shows it: the streams do not start together.
+const PICTURE_APART: i64 = 2_500_000;
 
 /// Opens the sessions at or below `root`.
 ///
@@ -276,15 +278,13 @@ fn rows_as_frames(video: Video, start: i64, poses: &[PoseRow]) -> Option<RowFram
     let shown: Vec<i64> = (0..video.info().frames)
         .map(|frame| (video.schedule().seconds(frame) * TICKS + 1e-3).floor() as i64)
         .collect();
-    let period = TICKS / video.info().fps;
     let (mut times, mut frames) = (Vec::new(), Vec::new());
     for row in poses {
         let tick = row.tick.saturating_sub(start);
         let Some(frame) = nearest(&shown, tick) else {
             continue;
         };
-        // Before the video begins or after it ends there is no picture.
-        if (shown[frame] - tick).abs() as f64 <= period {
+        if (shown[frame] - tick).abs() <= PICTURE_APART {
             times.push(row.time);
             frames.push(frame);
         }

@@ -251,6 +251,14 @@ fn what_is_not_there_or_damaged_ends_with_code_one() {
         "-o",
         to.to_str().unwrap(),
     ]);
+    // The other recording is converted, and what is left out is said.
+    assert_eq!(code, 0, "{err}");
+    assert!(
+        err.contains("excluded: `take_1`") && err.contains("signals.npz"),
+        "{err}"
+    );
+    std::fs::write(folder.path().join("in/take_0/signals.npz"), b"PK nothing").unwrap();
+    let (code, _, err) = reviv(&["data", "inspect", from.to_str().unwrap()]);
     assert_eq!(code, 1, "{err}");
     assert!(err.contains("signals.npz"), "{err}");
 }
