@@ -194,6 +194,9 @@ fn write(
         terminal.note("interrupted; give the same command again and it continues\n");
         return Err(Failure::Ended(130));
     }
+    let mut tally = converted.tally.clone();
+    tally.excluded = source.excluded().into_iter().map(|e| e.reason).collect();
+    let converted = Converted { tally, ..converted };
     folder.finish(converted.tally.clone()).map_err(failure)?;
     say(terminal, &converted, output, as_json);
     Ok(())
@@ -206,6 +209,7 @@ fn say(terminal: &Terminal, converted: &Converted, output: &Path, as_json: bool)
             "folder": of_path(output), "shards": converted.shards, "reused": converted.reused,
             "clips": tally.clips, "dropped": tally.dropped, "damaged": tally.damaged,
             "lost": tally.lost,
+            "excluded": tally.excluded,
         }));
         return;
     }

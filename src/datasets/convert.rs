@@ -61,6 +61,9 @@ pub struct Tally {
     /// Clips that go without a signal that their recording has, by signal and reason.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub lost: BTreeMap<String, usize>,
+    /// Recordings that could not be opened: the error of each.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub excluded: Vec<String>,
 }
 
 impl Tally {
@@ -100,6 +103,7 @@ impl Tally {
         for (signal, count) in &other.lost {
             *self.lost.entry(signal.clone()).or_default() += count;
         }
+        self.excluded.extend(other.excluded.iter().cloned());
     }
 }
 

@@ -165,6 +165,17 @@ impl Op for Clips {
         let mut splits = serde_json::Map::new();
         let mut remarks: Vec<String> = Vec::new();
         let mut name = "world".to_owned();
+        if let Some((_, source)) = parts.first() {
+            for (note, count) in source.notes() {
+                context.log(&format!("{note} ({count} recordings)"));
+            }
+            for excluded in source.excluded() {
+                context.log(&format!(
+                    "left out: `{}`: {}",
+                    excluded.recording, excluded.reason
+                ));
+            }
+        }
         for (split, source) in &parts {
             source.name().clone_into(&mut name);
             let folder = context.checkpoints().join("clips").join(split);
