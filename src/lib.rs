@@ -7,7 +7,8 @@
 //! * where experiments meet science: [`ops`]
 //! * the framework, which knows no model: [`experiment`], [`run`]
 //! * the science, which knows no YAML, no run directory and no terminal: [`training`], [`decoding`], [`reconstruction`],
-//!   [`evaluation`], [`view`], [`import`]; below them [`tokenizer`], [`mget`], [`masking`]; below them [`modality`],
+//!   [`evaluation`], [`view`], [`import`]; below them [`tokenizer`], [`mget`], [`masking`],
+//!   [`labelling`]; below them [`modality`],
 //!   [`clip`], [`datasets`], [`world`], [`video`]; and at the bottom [`nn`], [`engine`], [`geometry`], [`formats`], [`random`]
 #![recursion_limit = "256"]
 // Transforms are named `T_to_from`, tensors carry shape suffixes (`x_BND`): the field's own notation.
@@ -26,6 +27,7 @@ pub mod reconstruction;
 pub mod training;
 pub mod view;
 
+pub mod labelling;
 pub mod masking;
 pub mod mget;
 pub mod tokenizer;

@@ -9,6 +9,8 @@ mod mask;
 mod mget;
 mod optim;
 mod structure;
+mod tmr;
+mod vda;
 mod vq;
 
 use std::path::Path;
@@ -29,6 +31,8 @@ const FOLDERS: &[(&str, Check)] = &[
     ("mget", mget::check),
     ("optim", optim::check),
     ("structure", structure::check),
+    ("tmr", tmr::check),
+    ("vda", vda::check),
     ("vq", vq::check),
 ];
 

@@ -182,6 +182,21 @@ impl Vectors {
         Ok(())
     }
 
+    /// Compares an output of bytes, which must all be equal.
+    pub fn compare_bytes(
+        &mut self,
+        report: &mut Report,
+        name: &str,
+        shape: &[usize],
+        found: &[u8],
+    ) -> Outcome {
+        if self.start(report, name, shape).is_some() {
+            let values = self.tensor(name)?.u8(name)?;
+            report.exact(format!("{} {name}", self.name), found, values);
+        }
+        Ok(())
+    }
+
     /// Compares an output of flags, which must all be equal.
     pub fn compare_flags(
         &mut self,

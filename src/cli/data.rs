@@ -2,6 +2,7 @@
 
 mod convert;
 mod inspect;
+mod label_depth;
 mod status;
 mod synthesize;
 
@@ -34,6 +35,7 @@ enum Command {
     Status(status::StatusCommand),
     Inspect(inspect::Inspect),
     Convert(convert::Convert),
+    LabelDepth(label_depth::LabelDepth),
     Synthesize(synthesize::Synthesize),
 }
 
@@ -43,6 +45,7 @@ impl super::Run for Data {
             Command::Status(command) => command.run(terminal),
             Command::Inspect(command) => command.run(terminal),
             Command::Convert(command) => command.run(terminal),
+            Command::LabelDepth(command) => command.run(terminal),
             Command::Synthesize(command) => command.run(terminal),
         }
     }

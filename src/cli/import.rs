@@ -4,6 +4,7 @@ use super::terminal::{Failure, Terminal};
 use crate::formats::text::of_path;
 use crate::import::cosmos::parse_compression;
 use crate::import::{Checkpoint, ImportError, ImportOptions, import};
+use crate::labelling::DepthLabelKind;
 use serde_json::json;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
@@ -29,6 +30,9 @@ pub struct Import {
     /// Clips of a video tokenizer that is imported without a transformer: 16x256x256 unless given
     #[arg(long, value_name = "FxHxW")]
     clip: Option<String>,
+    /// What a depth network (Video Depth Anything) gives, which its file does not say: relative or metric
+    #[arg(long, value_name = "KIND")]
+    depth: Option<DepthLabelKind>,
     /// Write JSON to stdout
     #[arg(long)]
     json: bool,
@@ -58,6 +62,7 @@ impl super::Run for Import {
             heads: self.heads,
             compression,
             clip,
+            depth: self.depth,
         };
         let report = import(&self.files, &self.output, &options).map_err(failure)?;
         for notice in &report.notices {

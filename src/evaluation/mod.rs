@@ -1,7 +1,7 @@
 //! Metrics, statistics and tables (Sec. 5).
 //!
 //! Read in this order: [`outcome`] (what a metric can say), the metrics [`joints`], [`trajectory`], [`gaze`], [`depth`],
-//! [`motion`], [`tokens`], [`runtime`]; then [`metric`] (what a modality brings: [`sets`] are the
+//! [`motion`], [`tmr`] (the encoder of motions), [`tokens`], [`runtime`]; then [`metric`] (what a modality brings: [`sets`] are the
 //! built-in ones), [`evaluate`] (every clip of a [`suite`] into [`scores`]), [`statistics`], and [`compare`]
 //! (many scores into one [`table`], a `side` per row, which [`render`] prints and
 //! [`intervals`] draws; `verdict` says what beats the trivial baselines). [`tum`] compares trajectory files.
@@ -34,6 +34,7 @@ pub mod sets;
 pub mod statistics;
 pub mod suite;
 pub mod table;
+pub mod tmr;
 pub mod tokens;
 pub mod trajectory;
 pub mod tum;

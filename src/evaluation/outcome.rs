@@ -95,6 +95,12 @@ pub enum MetricError {
     },
     #[error("embedding {row} has length zero: it has no direction")]
     ZeroEmbedding { row: usize },
+    #[error("a motion of {found} frames; its features need at least {needed}")]
+    TooShort { found: usize, needed: usize },
+    #[error(
+        "joints: the bone to joint {joint} has no length in frame {frame}: its direction is not known"
+    )]
+    NoBone { frame: usize, joint: usize },
     #[error("code {code} is outside the codebook of {size}")]
     CodeOutside { code: i64, size: usize },
 }

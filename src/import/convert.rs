@@ -6,7 +6,9 @@ use super::hash::Hashes;
 use super::part::Part;
 use super::source::{Source, expand};
 use super::statistics::{self, Statistics};
+use super::vda;
 use crate::decoding::reconstructor::ModelManifest;
+use crate::labelling::DepthLabelKind;
 use crate::mget::MgetSpec;
 use serde_json::{Map, Value, json};
 use std::collections::BTreeMap;
@@ -21,6 +23,8 @@ pub struct ImportOptions {
     pub compression: Option<[usize; 2]>,
     /// Frames, height and width of the clips of a video tokenizer that is imported without a transformer.
     pub clip: Option<[usize; 3]>,
+    /// Whether a depth network is relative or metric: its file does not say.
+    pub depth: Option<DepthLabelKind>,
 }
 
 /// What an import did.
@@ -113,7 +117,9 @@ impl Set {
             return Err(ImportError::refused(&path, "no checkpoint was given"));
         }
         // In the order of writing: the transformer does not wait for its hash, and the others find theirs made.
-        sources.sort_by_key(|source| source.plan.family != "mget");
+        // What has no sizes of its own comes behind what it belongs to.
+        sources
+            .sort_by_key(|source| (source.plan.family != "mget", source.plan.settings.is_null()));
         let order = sources.iter().map(|source| source.path().to_owned());
         let mut hashes = Hashes::start(arrays.iter().cloned().chain(order).collect());
         let statistics = statistics::read(&arrays, &mut hashes)?;
@@ -176,6 +182,9 @@ impl Set {
                 _ => {}
             }
         }
+        if let Some(model) = self.alone()? {
+            models.push(model);
+        }
         for modality in statistics.keys() {
             let notice = format!("statistics of `{modality}` without its tokenizer: left out");
             self.notices.push(notice);
@@ -184,6 +193,33 @@ impl Set {
             self.compare_vocabularies(&spec, &models)?;
         }
         Ok(models)
+    }
+
+    /// A depth network or a motion encoder: each is a folder of its own.
+    fn alone(&mut self) -> Result<Option<Planned>, ImportError> {
+        let family = |part: &Part| part.first().plan.family;
+        let mut parts = self.parts.iter();
+        let Some((name, part)) = parts.find(|(_, part)| ["vda", "tmr"].contains(&family(part)))
+        else {
+            return Ok(None);
+        };
+        if self.parts.len() > 1 {
+            return Err(part.first().refuse(
+                "import a depth network or a motion encoder alone: it becomes a folder of its own",
+            ));
+        }
+        let model = match family(part) {
+            "vda" => {
+                let (model, kind, settings) = folder::depth_network(part)?;
+                let path = part.first().path().to_owned();
+                let sha256 = self.hashes.get(&path)?.sha256;
+                self.notices.extend(vda::doubt(&path, &sha256, kind));
+                self.notices.push(vda::licence(&settings).to_owned());
+                model
+            }
+            _ => folder::motion_encoder(part)?,
+        };
+        Ok(Some((name.clone(), model)))
     }
 
     /// Tokenizers and transformer of one set have the same vocabularies and grids.
@@ -270,8 +306,11 @@ impl Set {
             let file = self.hashes.get(source.path())?;
             inputs.push(source.account(&file.sha256, file.bytes));
         }
+        let kinds = ["mget", "depth_network", "motion_encoder"];
+        let kind = kinds.into_iter().find(|kind| parts.contains_key(*kind));
+        let kind = kind.unwrap_or("tokenizers");
         let manifest = json!({
-            "kind": if parts.contains_key("mget") { "mget" } else { "tokenizers" },
+            "kind": kind,
             "format": FORMAT,
             "imported": true,
             "parts": parts,

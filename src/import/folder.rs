@@ -5,6 +5,7 @@
 //! DIR/mget.json  weights.safetensors               the transformer
 //! DIR/tokenizers/camera/tokenizer.safetensors      weights and statistics of one modality, in one file
 //! DIR/model.json                                   which clips it takes, and which tokenizers belong to it
+//! DIR/weights.safetensors                          a depth network or a motion encoder, alone in its folder
 //! DIR/manifest.json                                every input with its SHA-256, every entry with what became of it
 //! ```
 
@@ -13,6 +14,9 @@ use super::part::{Part, Tensor, Values};
 use super::statistics::Statistics;
 use crate::clip::clock;
 use crate::engine::{Compute, Initialise, Parameters};
+use crate::evaluation::tmr::features::FEATURES;
+use crate::evaluation::tmr::{MotionEncoder, MotionEncoderSettings, stored as tmr};
+use crate::labelling::{self, DepthLabelKind, DepthNetwork, NetworkSettings};
 use crate::masking::PIXELS;
 use crate::mget::stored::{SPEC, WEIGHTS};
 use crate::mget::{Input, MgetSpec, ModalitySpec};
@@ -210,6 +214,68 @@ pub(super) fn video(
         }
     };
     Ok(wanted.into_iter().map(model).collect())
+}
+
+/// Weights that are a folder of their own.
+fn folder_of_its_own(part: &Part, file: &'static str, metadata: BTreeMap<String, String>) -> Model {
+    let plan = &part.first().plan;
+    Model {
+        name: plan.part.clone(),
+        folder: String::new(),
+        file,
+        metadata,
+        more: BTreeMap::new(),
+        beside: None,
+        settings: plan.settings.clone(),
+        statistics: None,
+        clip: None,
+    }
+}
+
+/// A depth network, with the kind that it was said to be and its sizes.
+pub(super) fn depth_network(
+    part: &Part,
+) -> Result<(Model, DepthLabelKind, NetworkSettings), ImportError> {
+    let source = part.first();
+    let refuse = |reason: String| source.refuse(reason);
+    let settings = &source.plan.settings;
+    let kind: DepthLabelKind =
+        serde_json::from_value(settings["kind"].clone()).map_err(|e| refuse(e.to_string()))?;
+    let network: NetworkSettings =
+        serde_json::from_value(settings["network"].clone()).map_err(|e| refuse(e.to_string()))?;
+    let compute = Compute::cpu();
+    let planned = DepthNetwork::new(&Initialise::meta(&compute), &network)
+        .map_err(|e| refuse(e.to_string()))?;
+    part.complete(&shapes(&planned))?;
+    let metadata = labelling::stored::describe(kind, &network);
+    let model = folder_of_its_own(part, labelling::stored::FILE, metadata);
+    Ok((model, kind, network))
+}
+
+/// TMR's motion encoder with its statistics.
+pub(super) fn motion_encoder(part: &Part) -> Result<Model, ImportError> {
+    let source = part.first();
+    let refuse = |reason: String| source.refuse(reason);
+    if source.plan.settings.is_null() {
+        return Err(refuse(
+            "statistics without their encoder; give `motion_encoder.pt` too".to_owned(),
+        ));
+    }
+    let settings: MotionEncoderSettings =
+        serde_json::from_value(source.plan.settings.clone()).map_err(|e| refuse(e.to_string()))?;
+    let compute = Compute::cpu();
+    let planned = MotionEncoder::new(&Initialise::meta(&compute), &settings).map_err(&refuse)?;
+    let mut expected = shapes(&planned);
+    for (name, file) in [(tmr::MEAN, "mean.pt"), (tmr::DEVIATION, "std.pt")] {
+        if !part.tensors.contains_key(name) {
+            return Err(refuse(format!(
+                "its statistics are missing: give `{file}` of `stats/humanml3d/guoh3dfeats` in TMR's repository too"
+            )));
+        }
+        expected.insert(name.to_owned(), vec![FEATURES]);
+    }
+    part.complete(&expected)?;
+    Ok(folder_of_its_own(part, tmr::FILE, tmr::describe(&settings)))
 }
 
 /// Frames, height and width of the clips that become a grid of tokens.

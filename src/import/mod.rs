@@ -1,8 +1,8 @@
 //! Weights released by others, read without executing anything and checked before anything is dropped.
 //!
 //! Read in this order: [`checkpoint`] (the entries of a `.pth`, a TorchScript archive or a safetensors file, streamed; its
-//! pickles are read by [`crate::formats::pickle`], an interpreter that can only describe data), [`rules`] (what may happen to an entry), [`mget`], [`vq`] and
-//! [`cosmos`] (which rule applies to which name of which release), [`statistics`] (normalisation files that travel with the
+//! pickles are read by [`crate::formats::pickle`], an interpreter that can only describe data), [`rules`] (what may happen to an entry), [`mget`], [`vq`],
+//! [`cosmos`], [`vda`] and [`tmr`] (which rule applies to which name of which release), [`statistics`] (normalisation files that travel with the
 //! weights), `source` (one file, checked), `part` (one model of one or several files), `folder` (what our files of it are)
 //! and [`convert`] (the whole import, and the manifest).
 //!
@@ -18,6 +18,8 @@ mod part;
 pub mod rules;
 mod source;
 pub mod statistics;
+pub mod tmr;
+pub mod vda;
 pub mod vq;
 
 pub use checkpoint::{Checkpoint, Entry, Format};

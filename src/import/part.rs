@@ -33,7 +33,9 @@ impl Part {
     pub fn new(mut sources: Vec<Source>) -> Result<Self, ImportError> {
         let mut tensors: BTreeMap<String, Tensor> = BTreeMap::new();
         for second in 0..sources.len() {
-            if sources[second].plan.settings != sources[0].plan.settings {
+            // Statistics that lie in files of their own have no sizes to compare.
+            let settings = &sources[second].plan.settings;
+            if !settings.is_null() && *settings != sources[0].plan.settings {
                 let first = sources[0].path().display();
                 return Err(sources[second].refuse(format!("differs in its sizes from {first}")));
             }

@@ -1,7 +1,7 @@
 //! One given checkpoint: recognised, checked entry by entry, and accounted for.
 
 use super::rules::{Plan, Rule};
-use super::{Checkpoint, ImportError, ImportOptions, cosmos, mget, vq};
+use super::{Checkpoint, ImportError, ImportOptions, cosmos, mget, tmr, vda, vq};
 use serde_json::{Map, Value, json};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -36,8 +36,14 @@ impl Source {
             vq::plan(&checkpoint, options.heads)
         } else if cosmos::matches(&checkpoint) {
             cosmos::plan(&checkpoint, options.compression)
+        } else if vda::matches(&checkpoint) {
+            vda::plan(&checkpoint, options.depth)
+        } else if tmr::matches(&checkpoint) {
+            tmr::plan(&checkpoint, options.heads)
         } else {
-            let mut reason = "neither a transformer nor a tokenizer of a known release".to_owned();
+            let mut reason =
+                "no transformer, tokenizer, depth network or motion encoder of a known release"
+                    .to_owned();
             if let Some(entry) = checkpoint.entries().first() {
                 reason += &format!("; its first tensor is called `{}`", entry.name);
             }
@@ -123,7 +129,15 @@ impl Source {
 
 /// Whether the names are those of a release.
 fn known(checkpoint: &Checkpoint) -> bool {
-    mget::matches(checkpoint) || vq::matches(checkpoint) || cosmos::matches(checkpoint)
+    [
+        mget::matches,
+        vq::matches,
+        cosmos::matches,
+        vda::matches,
+        tmr::matches,
+    ]
+    .iter()
+    .any(|matches| matches(checkpoint))
 }
 
 /// Files, and those in folders (and their `norm_stats`), sorted.

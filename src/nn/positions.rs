@@ -31,6 +31,25 @@ fn sine_cosine(position: usize, exponent: f32) -> (f32, f32) {
     (angle.sin() as f32, angle.cos() as f32)
 }
 
+/// One axis, sines and cosines in turn: channel `2 j` of position `p` is `sin(p 10000^(-2 j / width))`, channel `2 j + 1` the
+/// cosine. Rounded once, at the end.
+#[must_use]
+pub fn interleaved(positions: usize, width: usize) -> Vec<f32> {
+    (0..positions * width)
+        .map(|i| {
+            let (position, channel) = (i / width, i % width);
+            let exponent = (channel / 2 * 2) as f64 / width as f64;
+            let angle = position as f64 * 10_000_f64.powf(-exponent);
+            let value = if channel.is_multiple_of(2) {
+                angle.sin()
+            } else {
+                angle.cos()
+            };
+            value as f32
+        })
+        .collect()
+}
+
 /// Which way a table of a `rows x columns` grid of tokens is enumerated.
 #[derive(
     Debug,

@@ -9,6 +9,7 @@
 pub mod canvas;
 pub mod cloud;
 pub mod contact;
+pub mod depth_sheet;
 pub mod page;
 pub mod paths;
 pub mod scene;

@@ -11,3 +11,14 @@ fn every_tensor_of_the_parity_vectors_matches() {
     let report = check_parity::check(&shared.join("vectors/parity")).unwrap();
     assert!(report.passed(), "{report}");
 }
+
+#[test]
+fn every_tensor_of_the_depth_and_motion_vectors_matches() {
+    let Some(shared) = crate::shared::folder() else {
+        return;
+    };
+    for folder in ["vda", "tmr"] {
+        let report = check_parity::check(&shared.join("vectors").join(folder)).unwrap();
+        assert!(report.passed(), "{report}");
+    }
+}

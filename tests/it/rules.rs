@@ -15,7 +15,7 @@ const FLOORS: &[&[&str]] = &[
         "view",
         "import",
     ],
-    &["tokenizer", "mget", "masking"],
+    &["tokenizer", "mget", "masking", "labelling"],
     &["datasets", "world"],
     &["modality", "clip", "video"],
     &["nn", "engine", "geometry", "formats", "random"],

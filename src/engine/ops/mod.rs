@@ -6,11 +6,13 @@
 mod conv_window;
 mod fused;
 mod nearest;
+mod resize;
 mod unfused;
 mod vector;
 
 pub use conv_window::ConvWindow;
 pub use nearest::nearest;
+pub use resize::{Resize, Step, steps};
 /// Matrix products on slices of the host.
 pub use reviv_gemm as gemm;
 
@@ -184,6 +186,23 @@ pub fn frame_norm(
         return fused::run(operation, x, Some(weight), Some(bias));
     }
     unfused::frame_norm(x, weight, bias, frames, silu)
+}
+
+/// Frames of packed rows to another size, bilinearly with aligned corners: `x` is `[frames * height * width, C]`.
+///
+/// # Panics
+/// When `x` does not have the rows that `resize` speaks of, or a size is zero.
+#[must_use]
+pub fn resize(x: Tensor<2>, resize: Resize) -> Tensor<2> {
+    assert_eq!(x.dims()[0], resize.rows_in(), "{resize:?}");
+    assert!(resize.rows_out() > 0, "{resize:?}");
+    if resize.from == resize.to {
+        return x;
+    }
+    if fused::takes(&x) {
+        return fused::run(Fused::Resize { resize }, x, NONE, NONE);
+    }
+    unfused::resize(x, resize)
 }
 
 /// The rows `ids` of `table` `[V, D]`: `[N, D]`.

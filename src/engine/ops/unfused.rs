@@ -1,9 +1,9 @@
 //! Every operation unfused of the tensor library's own: what runs on GPU back ends, and what fused ones are tested against.
 
-use burn::tensor::{Tensor, activation};
+use burn::tensor::{Tensor, TensorData, activation};
 
 use super::super::Segments;
-use super::{AdamWStep, ConvWindow, FRAME_NORM_EPSILON, indices};
+use super::{AdamWStep, ConvWindow, FRAME_NORM_EPSILON, Resize, Step, indices, steps};
 
 pub fn linear(x: Tensor<2>, weight: Tensor<2>, bias: Option<Tensor<1>>) -> Tensor<2> {
     let y = x.matmul(weight.transpose());
@@ -137,6 +137,32 @@ pub fn frame_norm(
         * weight.reshape([1, channels])
         + bias.reshape([1, channels]);
     if silu { activation::silu(y) } else { y }
+}
+
+pub fn resize(x: Tensor<2>, resize: Resize) -> Tensor<2> {
+    let ([_, channels], Resize { frames, from, to }) = (x.dims(), resize);
+    let lines = x.reshape([frames, from[0], from[1] * channels]);
+    let lines = along(lines, &steps(from[0], to[0]));
+    let pixels = lines.reshape([frames * to[0], from[1], channels]);
+    along(pixels, &steps(from[1], to[1])).reshape([resize.rows_out(), channels])
+}
+
+/// Resizes the second axis.
+fn along(x: Tensor<3>, steps: &[Step]) -> Tensor<3> {
+    let device = x.device();
+    let pick = |at: fn(&Step) -> usize| {
+        let ids: Vec<i64> = steps.iter().map(|step| at(step) as i64).collect();
+        let ids = TensorData::new(ids, [steps.len()]);
+        x.clone().select(
+            1,
+            Tensor::from_data(ids, &device.clone().without_autodiff()),
+        )
+    };
+    let weights: Vec<f32> = steps.iter().map(|step| step.weight).collect();
+    let weights = TensorData::new(weights, [1, steps.len(), 1]);
+    let weights: Tensor<3> = Tensor::from_data(weights, &device.clone().without_autodiff());
+    let lower = pick(|step| step.lower) * (weights.clone().neg() + 1.0);
+    lower + pick(|step| step.upper) * weights
 }
 
 pub fn sum_of_squares(x: Tensor<1>) -> f64 {

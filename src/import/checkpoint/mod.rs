@@ -30,6 +30,9 @@ pub enum Format {
     Safetensors,
 }
 
+/// The name of the tensor in a file that holds nothing else.
+pub const BARE: &str = "tensor";
+
 /// One named tensor.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Entry {

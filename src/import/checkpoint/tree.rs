@@ -1,8 +1,8 @@
 //! What the objects of a torch pickle describe: the dictionary of tensors, or the tree of a compiled module, and the arguments
 //! beside it.
 
-use super::Format;
 use super::memory::{MAX_ENTRIES, MAX_NAME};
+use super::{BARE, Format};
 use crate::formats::pickle::{Global, Id, Node, Pickle, TensorView};
 use serde_json::{Map, Value};
 use std::collections::BTreeSet;
@@ -103,7 +103,7 @@ pub(super) fn contents(pickle: &Pickle) -> Result<Contents, String> {
         }
         // Without names: one tensor, or several in their order.
         Node::Tensor(view) => {
-            tree.push("tensor", view)?;
+            tree.push(BARE, view)?;
             Format::Torch
         }
         Node::List(items) | Node::Tuple(items) => {

@@ -12,6 +12,7 @@ mod flat;
 mod frame_norm;
 mod layer_norm;
 mod linear;
+mod resize;
 
 use std::mem::MaybeUninit;
 use std::sync::Arc;
@@ -27,7 +28,7 @@ use burn_flex::FlexTensor;
 pub use flat::{adamw, sum_of_squares};
 
 use super::super::Segments;
-use super::{ConvWindow, vector};
+use super::{ConvWindow, Resize, vector};
 
 /// An array on the host: dense, row-major, f32.
 #[derive(Debug, Clone)]
@@ -111,6 +112,7 @@ pub enum Fused {
     TiedCrossEntropy { targets: Arc<[u32]> },
     Convolution { taps: ConvWindow },
     FrameNorm { frames: usize, silu: bool },
+    Resize { resize: Resize },
 }
 
 impl Fused {
@@ -132,6 +134,7 @@ impl Fused {
                 frames: *frames,
                 silu: *silu,
             }),
+            Self::Resize { resize } => run(&resize::Bilinear { resize: *resize }),
         }
     }
 }
@@ -392,8 +395,37 @@ mod tests {
         ]
     }
 
+    const LARGER: Resize = Resize {
+        frames: 3,
+        from: [5, 4],
+        to: [9, 11],
+    };
+    const SMALLER: Resize = Resize {
+        frames: 2,
+        from: [7, 6],
+        to: [1, 4],
+    };
+
+    fn resize_cases() -> Vec<Case> {
+        vec![
+            (
+                "a larger picture",
+                vec![wave([60, 3], 0.0)],
+                |x| ops::resize(x[0].clone(), LARGER),
+                |x| unfused::resize(x[0].clone(), LARGER),
+            ),
+            (
+                "a smaller picture",
+                vec![wave([84, 5], 0.0)],
+                |x| ops::resize(x[0].clone(), SMALLER),
+                |x| unfused::resize(x[0].clone(), SMALLER),
+            ),
+        ]
+    }
+
     fn cases() -> Vec<Case> {
         let mut cases = token_cases();
+        cases.extend(resize_cases());
         cases.extend(video_cases());
         cases
     }

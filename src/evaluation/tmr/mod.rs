@@ -1,0 +1,147 @@
+//! The motion encoder behind the FID and the similarity of motions (Table 2): TMR, whose weights a user brings.
+//!
+//! Joints of a clip become 22 joints with y up ([`skeleton`]), are resampled ([`resample`]), turned into 263 numbers per frame
+//! step ([`features`]) and embedded by a transformer ([`encoder`]); [`stored`] is the folder that `reviv import` makes, and this
+//! file the whole chain. Features and their errors are those of the code the weights were trained with, quirks included; each is
+//! named where it is. All geometry is f64.
+
+pub mod encoder;
+pub mod features;
+pub mod resample;
+pub mod skeleton;
+pub mod stored;
+
+use ndarray::{ArrayView3, Axis};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use super::outcome::MetricError;
+pub use encoder::{MotionEncoder, MotionEncoderSettings};
+use features::{FEATURES, features};
+use resample::at_rate;
+use skeleton::{Pose, spine_filled, y_up};
+
+/// The rate of the motions that the encoder was trained on, Hz.
+pub const TRAINED_RATE: f64 = 20.0;
+
+/// At which rate features are computed. Embeddings of different rates do not compare.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(rename_all = "snake_case")]
+pub enum FeatureRate {
+    /// 20 Hz, as in training: motions are resampled linearly.
+    #[default]
+    Trained,
+    /// The motion's own rate.
+    Native,
+}
+
+/// An encoder with the statistics its inputs are normalised by.
+#[derive(Debug, Clone)]
+pub struct Tmr {
+    pub encoder: MotionEncoder,
+    /// Of every feature.
+    mean: Vec<f32>,
+    deviation: Vec<f32>,
+}
+
+impl Tmr {
+    /// An encoder with its statistics.
+    ///
+    /// # Errors
+    /// When there are not [`FEATURES`] of each, or one is not finite, or a deviation is negative.
+    pub fn new(
+        encoder: MotionEncoder,
+        mean: Vec<f32>,
+        deviation: Vec<f32>,
+    ) -> Result<Self, String> {
+        for (name, values) in [("mean", &mean), ("std", &deviation)] {
+            if values.len() != FEATURES {
+                return Err(format!(
+                    "{name}: {} values, expected {FEATURES}",
+                    values.len()
+                ));
+            }
+            if values.iter().any(|value| !value.is_finite()) {
+                return Err(format!("{name}: a value is not finite"));
+            }
+        }
+        if deviation.iter().any(|value| *value < 0.0) {
+            return Err("std: a value is negative".to_owned());
+        }
+        Ok(Self {
+            encoder,
+            mean,
+            deviation,
+        })
+    }
+
+    #[must_use]
+    pub fn statistics(&self) -> [&[f32]; 2] {
+        [&self.mean, &self.deviation]
+    }
+
+    /// `(x - mean) / (std + 1e-12)`, in f32 as in training, of rows of [`FEATURES`].
+    #[must_use]
+    pub fn normalise(&self, rows: &[f32]) -> Vec<f32> {
+        let statistics = self.mean.iter().zip(&self.deviation).cycle();
+        rows.iter()
+            .zip(statistics)
+            .map(|(value, (mean, deviation))| (value - mean) / (deviation + 1e-12))
+            .collect()
+    }
+
+    /// The embedding of a clip's body: `[T, 21, 3]` metres in the product's order, z up, sampled at `rate` Hz.
+    ///
+    /// # Errors
+    /// When the clip is too short, or its joints have no features.
+    pub fn embed(
+        &self,
+        joints: ArrayView3<'_, f64>,
+        rate: f64,
+        feature_rate: FeatureRate,
+    ) -> Result<Vec<f64>, MetricError> {
+        let input = self.input(joints, rate, feature_rate)?;
+        let rows: Vec<f32> = features(&input)?
+            .rows
+            .iter()
+            .flatten()
+            .map(|value| *value as f32)
+            .collect();
+        let embedded = self.encoder.forward(&[&self.normalise(&rows)]);
+        Ok(embedded[0]
+            .mu
+            .iter()
+            .map(|value| f64::from(*value))
+            .collect())
+    }
+
+    /// What features are computed from: 22 joints, y up, at the feature rate.
+    ///
+    /// # Errors
+    /// When the shape is not `[T, 21, 3]`, or the rate is none.
+    pub fn input(
+        &self,
+        joints: ArrayView3<'_, f64>,
+        rate: f64,
+        feature_rate: FeatureRate,
+    ) -> Result<Vec<Pose>, MetricError> {
+        if joints.shape()[1..] != [21, 3] {
+            return Err(MetricError::Shape {
+                field: "joints",
+                found: joints.shape().to_vec(),
+                expected: vec![joints.len_of(Axis(0)), 21, 3],
+            });
+        }
+        let poses: Vec<Pose> = joints
+            .outer_iter()
+            .map(|pose| {
+                let joint = |j: usize| [pose[[j, 0]], pose[[j, 1]], pose[[j, 2]]];
+                y_up(&spine_filled(&std::array::from_fn(joint)))
+            })
+            .collect();
+        Ok(match feature_rate {
+            FeatureRate::Native => poses,
+            FeatureRate::Trained => at_rate(&poses, rate, TRAINED_RATE),
+        })
+    }
+}
