@@ -43,7 +43,6 @@ impl std::str::FromStr for DepthFormat {
 pub struct DepthFiles {
     folder: PathBuf,
     format: DepthFormat,
-    kind: DepthLabelKind,
     /// Height and width.
     size: [usize; 2],
     /// Values that wait for the number of frames or for their extremes, where the format needs those.
@@ -84,7 +83,6 @@ impl DepthFiles {
         let mut files = Self {
             folder: folder.to_owned(),
             format,
-            kind,
             size,
             waiting,
             frames: 0,
