@@ -44,6 +44,9 @@ pub struct Reconstruct {
     /// Metric depth of another model to take the scale from: npz, or a folder of EXR or 16-bit PNG
     #[arg(long, value_name = "PATH")]
     anchor: Option<PathBuf>,
+    /// A metric depth network to take the scale from, as `reviv import --depth metric` makes it
+    #[arg(long, value_name = "DIR", conflicts_with = "anchor")]
+    anchor_model: Option<PathBuf>,
     /// At most so many seconds of the video
     #[arg(long, value_name = "SECONDS")]
     seconds: Option<f64>,
@@ -132,6 +135,9 @@ impl Reconstruct {
         }
         if let Some(path) = &self.anchor {
             set.push(change("anchor", &text(path)?));
+        }
+        if let Some(path) = &self.anchor_model {
+            set.push(change("anchor_model", &text(path)?));
         }
         if let Some(seconds) = self.seconds {
             set.push(change("seconds", &seconds.to_string()));

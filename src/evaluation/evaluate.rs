@@ -77,10 +77,7 @@ pub fn evaluate(
 ) -> Result<Scores, EvaluationError> {
     let plan = Plan::new(suite)?;
     let ids = pairs.ids();
-    let chosen = match &suite.sample {
-        Some(sample) => sample.draw(ids),
-        None => (0..ids.len()).collect(),
-    };
+    let chosen = suite.chosen(ids);
     let means = plan.means(pairs, &chosen)?;
     let mut rows: Vec<(usize, Row)> = Vec::with_capacity(chosen.len());
     let mut left_out: BTreeMap<String, usize> = BTreeMap::new();

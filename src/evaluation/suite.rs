@@ -56,6 +56,15 @@ pub struct UnknownMetric {
 }
 
 impl Suite {
+    /// The clips of `ids` that are evaluated, by their place.
+    #[must_use]
+    pub fn chosen(&self, ids: &[String]) -> Vec<usize> {
+        match &self.sample {
+            Some(sample) => sample.draw(ids),
+            None => (0..ids.len()).collect(),
+        }
+    }
+
     /// The columns that `metrics` names, in that order, each once.
     ///
     /// # Errors

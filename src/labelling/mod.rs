@@ -7,8 +7,9 @@
 //! In reading order: [`settings`] (sizes), [`preprocess`] (a frame to the network's input), [`encoder`], [`motion`], [`head`],
 //! [`network`] (both together), [`plan`] (which frames a window sees), [`stitch`] (windows to one video), [`labeller`] (frames in,
 //! depth out, memory flat in the length of the video), [`stored`] (the folder that a user keeps), [`levels`] (labels as video),
-//! [`files`] (labels for other programs).
+//! [`files`] (labels for other programs), [`clips`] (labels of clips).
 
+pub mod clips;
 pub mod encoder;
 pub mod files;
 pub mod head;

@@ -26,31 +26,65 @@ pub fn describe(kind: DepthLabelKind, settings: &NetworkSettings) -> BTreeMap<St
     .into()
 }
 
+/// The most bytes of a header: names and shapes of a few hundred tensors.
+const MAX_HEADER: u64 = 1 << 24;
+
+/// Kind and sizes of the network in a folder; its weights are not read.
+///
+/// # Errors
+/// When there is no depth network.
+pub fn described(folder: &Path) -> Result<(DepthLabelKind, NetworkSettings), LabelError> {
+    use std::io::Read;
+    let path = folder.join(FILE);
+    let mut file = std::fs::File::open(&path).map_err(|_| absent(&path))?;
+    let mut length = [0; 8];
+    let mut header = Vec::new();
+    let read = file.read_exact(&mut length).and_then(|()| {
+        let length = u64::from_le_bytes(length).min(MAX_HEADER);
+        file.take(length).read_to_end(&mut header)
+    });
+    let refuse = |reason: &dyn std::fmt::Display| {
+        LabelError::Settings(format!("{}: {reason}", path.display()))
+    };
+    read.map_err(|error| refuse(&error))?;
+    let header: serde_json::Value = serde_json::from_slice(&header)
+        .map_err(|_| refuse(&"these are no weights of a depth network"))?;
+    let metadata: BTreeMap<String, String> =
+        serde_json::from_value(header["__metadata__"].clone()).unwrap_or_default();
+    parsed(&path, &metadata)
+}
+
+fn absent(path: &Path) -> LabelError {
+    LabelError::Settings(format!(
+        "{} does not exist; `reviv import` makes a folder of a depth network from the released file",
+        path.display()
+    ))
+}
+
+fn parsed(
+    path: &Path,
+    metadata: &BTreeMap<String, String>,
+) -> Result<(DepthLabelKind, NetworkSettings), LabelError> {
+    let refuse = |reason: String| LabelError::Settings(format!("{}: {reason}", path.display()));
+    let text = |key: &str| metadata.get(key).map(String::as_str).unwrap_or_default();
+    if text("format") != FORMAT {
+        return Err(refuse("these are no weights of a depth network".to_owned()));
+    }
+    let kind: DepthLabelKind = text("kind").parse().map_err(&refuse)?;
+    let settings: NetworkSettings =
+        serde_json::from_str(text("settings")).map_err(|error| refuse(error.to_string()))?;
+    settings.check()?;
+    Ok((kind, settings))
+}
+
 /// The SHA-256 of the weights of a folder.
 ///
 /// # Errors
 /// When they cannot be read.
 pub fn fingerprint(folder: &Path) -> Result<String, LabelError> {
-    use sha2::{Digest, Sha256};
-    use std::fmt::Write as _;
-    use std::io::Read;
     let path = folder.join(FILE);
-    let failed = |error: std::io::Error| LabelError::Files(format!("{}: {error}", path.display()));
-    let mut file = std::fs::File::open(&path).map_err(failed)?;
-    let mut hasher = Sha256::new();
-    let mut buffer = vec![0; 1 << 20];
-    loop {
-        let count = file.read(&mut buffer).map_err(failed)?;
-        if count == 0 {
-            break;
-        }
-        hasher.update(&buffer[..count]);
-    }
-    let mut text = String::new();
-    for byte in hasher.finalize() {
-        let _ = write!(text, "{byte:02x}");
-    }
-    Ok(text)
+    crate::formats::sha256_of(&path)
+        .map_err(|error| LabelError::Files(format!("{}: {error}", path.display())))
 }
 
 impl DepthLabeller {
@@ -62,22 +96,11 @@ impl DepthLabeller {
         let path = folder.join(FILE);
         let refuse = |reason: String| LabelError::Settings(format!("{}: {reason}", path.display()));
         if !path.is_file() {
-            return Err(refuse(
-                "does not exist; `reviv import` makes a folder of a depth network from the released file".to_owned(),
-            ));
+            return Err(absent(&path));
         }
         let mut weights = Weights::read(&path)?;
         let metadata = std::mem::take(&mut weights.metadata);
-        let text = |key: &str| metadata.get(key).map(String::as_str).unwrap_or_default();
-        if text("format") != FORMAT {
-            return Err(refuse(format!(
-                "these are no weights of a depth network (`{}`)",
-                text("format").escape_debug()
-            )));
-        }
-        let kind: DepthLabelKind = text("kind").parse().map_err(&refuse)?;
-        let settings: NetworkSettings =
-            serde_json::from_str(text("settings")).map_err(|error| refuse(error.to_string()))?;
+        let (kind, settings) = parsed(&path, &metadata)?;
         let unfit = |error: crate::engine::EngineError| refuse(error.to_string());
         DepthNetwork::new(&Initialise::meta(compute), &settings)?
             .check_shapes(&weights)

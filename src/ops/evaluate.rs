@@ -5,12 +5,14 @@
 
 use super::modality_entry::{DEFAULTS, read_defaults};
 use crate::clip::store::ClipSet;
+use crate::engine::Compute;
 use crate::evaluation::compare::{CompareSettings, Method, compare};
 use crate::evaluation::evaluate::Pairs;
 use crate::evaluation::evaluate::{Embeddings, EvaluationError, evaluate};
 use crate::evaluation::folders::{Folders, Stored};
 use crate::evaluation::render::{Format, render};
 use crate::evaluation::suite::Suite;
+use crate::evaluation::tmr::{FeatureRate, Tmr};
 use crate::experiment::{
     Arity, ArtifactKind, Code, Description, Entry, FileInput, FilePath, Inputs, Op, OpEntry, Port,
     Problem, StageContext, StageError,
@@ -40,6 +42,10 @@ pub struct EvaluateSettings {
     pub system: Option<String>,
     /// Motion embeddings of a model that is not part of this program (TMR): an npz with `predicted` and `truth`, `[clips, 256]`.
     pub embeddings: Option<FilePath>,
+    /// The folder of a motion encoder (TMR), as `reviv import` makes it: what `motion.fid` and `motion.similarity` embed bodies with.
+    pub motion_encoder: Option<FilePath>,
+    /// At which rate the motions are embedded; numbers of different rates do not compare.
+    pub motion_rate: FeatureRate,
 }
 
 impl Default for EvaluateSettings {
@@ -54,6 +60,8 @@ impl Default for EvaluateSettings {
             split: "test".to_owned(),
             system: None,
             embeddings: None,
+            motion_encoder: None,
+            motion_rate: FeatureRate::default(),
         }
     }
 }
@@ -71,7 +79,7 @@ impl Op for Evaluate {
     }
 
     fn version(&self) -> u32 {
-        3
+        4
     }
 
     fn about(&self) -> &'static str {
@@ -104,11 +112,19 @@ impl Op for Evaluate {
     }
 
     fn files(&self, settings: &EvaluateSettings) -> Vec<FileInput> {
-        let file = |path: &FilePath| FileInput {
-            key: "embeddings".to_owned(),
-            path: path.0.clone().into(),
+        let file = |key: &str, path: &Option<FilePath>| {
+            path.as_ref().map(|path| FileInput {
+                key: key.to_owned(),
+                path: path.0.clone().into(),
+            })
         };
-        settings.embeddings.iter().map(file).collect()
+        [
+            file("embeddings", &settings.embeddings),
+            file("motion_encoder", &settings.motion_encoder),
+        ]
+        .into_iter()
+        .flatten()
+        .collect()
     }
 
     fn data(&self, settings: &EvaluateSettings) -> Vec<(String, String)> {
@@ -129,6 +145,16 @@ impl Op for Evaluate {
         inputs: &Inputs<'_>,
         problems: &mut Vec<Problem>,
     ) -> Description {
+        if settings.embeddings.is_some() && settings.motion_encoder.is_some() {
+            problems.push(
+                Problem::new(
+                    Code::E0206,
+                    "embeddings",
+                    "motions are embedded once: by `motion_encoder`, or elsewhere",
+                )
+                .help("leave one of the two out"),
+            );
+        }
         let connected = inputs.one("predictions").is_some();
         if connected == settings.predictions_data.is_some() {
             problems.push(
@@ -180,12 +206,22 @@ impl Op for Evaluate {
             (None, Some(artifact)) => open(&artifact.path)?,
             (None, None) => return Err(input("no predictions", "name a stage in `predictions`")),
         };
-        let embeddings = settings
+        let mut embeddings = settings
             .embeddings
             .as_ref()
             .map(|path| read_embeddings(path.as_ref()))
             .transpose()
             .map_err(StageError::other)?;
+        let encoder = settings
+            .motion_encoder
+            .as_ref()
+            .map(|path| Tmr::open(path.as_ref(), &Compute::cpu()))
+            .transpose()
+            .map_err(|error| {
+                let help =
+                    "`reviv import motion_encoder.pt mean.pt std.pt -o DIR` makes the folder";
+                input(&error.to_string(), help)
+            })?;
         let system = settings
             .system
             .clone()
@@ -207,6 +243,14 @@ impl Op for Evaluate {
             let truth = open(data_root(context, &settings.truth_data)?)?;
             Box::new(Folders::new(truth, predictions).map_err(StageError::other)?)
         };
+        let mut notes = Vec::new();
+        if let Some(tmr) = &encoder {
+            let chosen = suite.chosen(pairs.ids());
+            let made = tmr.embed_pairs(pairs.as_ref(), &chosen, settings.motion_rate);
+            let (made, about) = made.map_err(|error| input(&error.to_string(), &help(&error)))?;
+            embeddings = Some(made);
+            notes.push(about);
+        }
         let outcome = evaluate(
             &settings.suite.name,
             &suite,
@@ -218,11 +262,12 @@ impl Op for Evaluate {
                 !context.interrupted()
             },
         );
-        let scores = match outcome {
+        let mut scores = match outcome {
             Ok(scores) => scores,
             Err(EvaluationError::Interrupted) => return Err(StageError::Interrupted),
             Err(error) => return Err(input(&error.to_string(), &help(&error))),
         };
+        scores.notes.extend(notes);
         scores.write(context.output()).map_err(StageError::other)?;
         let clips = scores.clips.len();
         let entrant = Method {

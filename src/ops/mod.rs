@@ -5,6 +5,7 @@ pub mod clips;
 mod evaluate;
 mod import;
 mod kinds;
+pub mod label_depth;
 mod modality_entry;
 mod predict;
 mod reconstruct;

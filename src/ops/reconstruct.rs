@@ -58,6 +58,8 @@ pub struct ReconstructSettings {
     /// Metric depth of another model at the frames of the model's video, instead of the floor: npz, or a folder of EXR or
     /// 16-bit PNG (millimetres).
     pub anchor: Option<FilePath>,
+    /// The folder of a metric depth network (`reviv import --depth metric`) that makes the anchor from the video itself.
+    pub anchor_model: Option<FilePath>,
 }
 
 impl Default for ReconstructSettings {
@@ -80,6 +82,7 @@ impl Default for ReconstructSettings {
             lens: LensSettings::default(),
             floor: FloorFit::default(),
             anchor: None,
+            anchor_model: None,
         }
     }
 }
@@ -129,6 +132,7 @@ impl Op for Reconstruct {
         [
             ("video", &settings.video),
             ("anchor", &settings.anchor),
+            ("anchor_model", &settings.anchor_model),
             ("model_folder", &settings.model_folder),
         ]
         .into_iter()
@@ -158,6 +162,12 @@ impl Op for Reconstruct {
                     .help("leave out `model` or `model_folder`"),
             ),
             _ => {}
+        }
+        if settings.anchor.is_some() && settings.anchor_model.is_some() {
+            problems.push(
+                Problem::new(Code::E0301, "anchor_model", "two anchors")
+                    .help("leave out `anchor` or `anchor_model`"),
+            );
         }
         let clips = inputs.one("clips");
         match (clips, &settings.video) {

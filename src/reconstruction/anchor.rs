@@ -7,7 +7,8 @@
 use super::folder::thin;
 use crate::formats::FormatError;
 use crate::formats::npz::Npz;
-use crate::video::image::grey16_from_png;
+use crate::labelling::{DepthLabelKind, DepthLabeller, LabelError, LabelOptions};
+use crate::video::image::{Image, grey16_from_png};
 use ndarray::{Array2, Array3, ArrayView2, Axis, s};
 use std::path::{Path, PathBuf};
 
@@ -60,6 +61,38 @@ pub fn read(path: &Path, frames: usize) -> Result<Array3<f32>, AnchorError> {
         }
     });
     Ok(maps)
+}
+
+/// As [`read`], of a video that a metric network labels: one map per frame that comes.
+///
+/// # Errors
+/// What the frames refuse; when there is none, or the network is relative.
+pub fn labelled<E: From<LabelError>>(
+    labeller: &DepthLabeller,
+    frames: impl IntoIterator<Item = Result<Image, E>>,
+) -> Result<Vec<Array2<f32>>, E> {
+    if labeller.kind() == DepthLabelKind::Relative {
+        let reason = "a relative depth network has no metres to anchor the scale with; import metric weights";
+        return Err(LabelError::Settings(reason.to_owned()).into());
+    }
+    let size = std::cell::Cell::new([0, 0]);
+    let frames = frames.into_iter().map(|frame| {
+        let frame = frame?;
+        size.set([frame.height as usize, frame.width as usize]);
+        Ok(frame)
+    });
+    let mut squares = Vec::new();
+    labeller.label(frames, &LabelOptions::default(), &mut |_, metres| {
+        let [height, width] = size.get();
+        let metres = metres
+            .into_iter()
+            .map(|metres| if metres > 0.0 { metres } else { f32::NAN });
+        let map = Array2::from_shape_vec((height, width), metres.collect())
+            .map_err(|error| LabelError::Frames(error.to_string()))?;
+        squares.push(square(map.view()));
+        Ok(())
+    })?;
+    Ok(squares)
 }
 
 /// Of `found` maps those nearest in time to `frames` frames that span the same time.

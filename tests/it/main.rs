@@ -54,5 +54,6 @@ mod import_bad;
 mod import_models;
 mod import_show;
 mod import_used;
+mod labelling;
 mod released;
 mod torch;

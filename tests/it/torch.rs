@@ -107,8 +107,32 @@ pub fn script(tensors: &[(&str, &str, Vec<u8>)]) -> Vec<u8> {
     out
 }
 
+/// An `OrderedDict` of tensors at the top: the form of a bare state dictionary.
+fn state(tensors: &[(String, Vec<u8>)]) -> Vec<u8> {
+    let mut out = b"\x80\x02ccollections\nOrderedDict\n)R(".to_vec();
+    for (name, opcodes) in tensors {
+        text(&mut out, name);
+        out.extend(opcodes);
+    }
+    out.extend(b"u.");
+    out
+}
+
+/// As [`save`], with the tensors at the top of the file.
+pub fn save_state(out: impl Write, tensors: &[Saved]) {
+    write(out, tensors, state);
+}
+
 /// Writes a `.pth` file; storages are made one at a time.
 pub fn save(out: impl Write, tensors: &[Saved], arguments: &[(&str, Argument)]) {
+    write(out, tensors, |described| pickle(described, arguments));
+}
+
+fn write(
+    out: impl Write,
+    tensors: &[Saved],
+    pickled: impl FnOnce(&[(String, Vec<u8>)]) -> Vec<u8>,
+) {
     let described: Vec<(String, Vec<u8>)> = tensors
         .iter()
         .enumerate()
@@ -120,7 +144,7 @@ pub fn save(out: impl Write, tensors: &[Saved], arguments: &[(&str, Argument)]) 
         })
         .collect();
     let mut zip = ZipWriter::new(out);
-    zip.add("checkpoint/data.pkl", &pickle(&described, arguments))
+    zip.add("checkpoint/data.pkl", &pickled(&described))
         .unwrap();
     zip.add("checkpoint/byteorder", b"little").unwrap();
     for (index, saved) in tensors.iter().enumerate() {

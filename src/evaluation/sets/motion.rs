@@ -7,7 +7,7 @@ use crate::evaluation::metric::{
     AllClips, Baseline, ClipScore, Embeddings, Features, MetricEntry, MetricSet, OverClips, Pair,
 };
 use crate::evaluation::motion::{
-    KinScores, frechet_distance, kin_scores, kinematic_descriptor, mean_cosine,
+    KinScores, frechet_distance, kin_scores, kinematic_descriptor, mean_cosine, score01,
 };
 use crate::evaluation::outcome::{MetricError, Outcome};
 use crate::evaluation::scores::SetScore;
@@ -113,19 +113,25 @@ impl MetricSet for EmbeddingMetrics {
     }
 
     fn columns(&self) -> &'static [ColumnInfo] {
-        const UNIT: &str = "Fréchet distance of TMR embeddings, rows of unit length";
+        const UNIT: &str = "Fréchet distance of TMR embeddings of the body, rows of unit length";
+        const RAW: &str = "Fréchet distance of TMR embeddings of the body, rows as they are";
+        const SHIFTED: &str = "mean of (cos + 1)/2 of TMR embeddings of the body";
+        const COSINE: &str = "mean cosine of TMR embeddings of the body";
         const {
             &[
-                ColumnInfo::lower("body.tmr_fid", "", UNIT).per_set(),
-                ColumnInfo::lower("body.tmr_fid_raw", "", "Fréchet distance of TMR embeddings")
-                    .per_set(),
-                ColumnInfo::higher("body.tmr_similarity", "", "mean cosine of TMR embeddings")
-                    .per_set(),
+                ColumnInfo::lower("motion.fid", "", UNIT).per_set(),
+                ColumnInfo::lower("motion.fid_raw", "", RAW).per_set(),
+                ColumnInfo::higher("motion.similarity", "", SHIFTED).per_set(),
+                ColumnInfo::higher("motion.cosine", "", COSINE).per_set(),
             ]
         }
     }
 
-    /// The body is embedded by a program that the user runs; a clip has nothing to score.
+    fn modalities<'a>(&self, _: &'a Column) -> Vec<&'a str> {
+        vec![BODY.name()]
+    }
+
+    /// The body is embedded beforehand, by [`crate::evaluation::tmr`] or the user; a clip has nothing to score.
     fn score(&self, _: &Pair<'_>, _: &[Column]) -> Result<ClipScore, MetricError> {
         Ok(ClipScore::default())
     }
@@ -142,15 +148,18 @@ impl MetricSet for EmbeddingMetrics {
                 n: 0,
                 dim: 0,
                 floor: None,
-                unavailable: Some("unavailable: TMR weights not configured".to_owned()),
+                unavailable: Some(
+                    "unavailable: no `motion_encoder` and no `embeddings`".to_owned(),
+                ),
             };
             if let Some(Embeddings { predicted, truth }) = clips.embeddings {
                 let (p, t) = (predicted.view(), truth.view());
                 (score.n, score.dim) = (p.nrows(), p.ncols());
                 score.unavailable = None;
                 score.value = match column.metric() {
-                    "tmr_fid" => frechet_distance(p, t, true),
-                    "tmr_fid_raw" => frechet_distance(p, t, false),
+                    "fid" => frechet_distance(p, t, true),
+                    "fid_raw" => frechet_distance(p, t, false),
+                    "similarity" => mean_cosine(p, t).map(|cosine| cosine.map(score01)),
                     _ => mean_cosine(p, t),
                 }?;
             }

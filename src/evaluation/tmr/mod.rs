@@ -7,6 +7,7 @@
 
 pub mod encoder;
 pub mod features;
+mod pairs;
 pub mod resample;
 pub mod skeleton;
 pub mod stored;
@@ -42,6 +43,8 @@ pub struct Tmr {
     /// Of every feature.
     mean: Vec<f32>,
     deviation: Vec<f32>,
+    /// SHA-256 of the file it was read from.
+    fingerprint: String,
 }
 
 impl Tmr {
@@ -72,7 +75,14 @@ impl Tmr {
             encoder,
             mean,
             deviation,
+            fingerprint: String::new(),
         })
+    }
+
+    /// SHA-256 of the file it was read from; empty where it was made here.
+    #[must_use]
+    pub fn fingerprint(&self) -> &str {
+        &self.fingerprint
     }
 
     #[must_use]

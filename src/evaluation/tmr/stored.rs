@@ -65,7 +65,9 @@ impl Tmr {
         let mut encoder =
             MotionEncoder::new(&Initialise::empty(compute), &settings).map_err(&refuse)?;
         encoder.load(&weights)?;
-        Self::new(encoder, mean, deviation).map_err(refuse)
+        let mut tmr = Self::new(encoder, mean, deviation).map_err(&refuse)?;
+        tmr.fingerprint = crate::formats::sha256_of(&path).map_err(|e| refuse(e.to_string()))?;
+        Ok(tmr)
     }
 
     /// Writes the folder's file; equal encoders give equal bytes.

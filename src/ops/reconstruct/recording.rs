@@ -6,14 +6,16 @@ use crate::clip::{Clip, Intrinsics, RGB, Rgb};
 use crate::experiment::{Code, InputArtifact, StageError};
 use crate::formats::ReadError;
 use crate::geometry::rigid::Rigid;
+use crate::labelling::{DepthLabeller, LabelError};
 use crate::modality::ClipFormat;
+use crate::reconstruction::anchor;
 use crate::reconstruction::lens::{LensError, LensSettings};
 use crate::reconstruction::windows::Window;
 use crate::video::image::Image;
 use crate::video::{self, Video};
 use crate::view::Fact;
 use crate::view::scene::{Badge, Tone};
-use ndarray::Array4;
+use ndarray::{Array3, Array4, Axis};
 use std::collections::BTreeMap;
 use std::fmt::Display;
 
@@ -246,6 +248,63 @@ impl Recording {
             clip,
             format,
         })
+    }
+
+    /// The metric depth that a network sees in `count` frames at `rate`, on the grid that the fits use: `[count, S, S]`. It sees
+    /// whole pictures; of its maps the centre square is taken, as of the video.
+    pub fn anchor(
+        &self,
+        network: &DepthLabeller,
+        rate: f64,
+        count: usize,
+    ) -> Result<Array3<f32>, StageError> {
+        let failed = |stop: Stop| match stop {
+            Stop::Label(error) => input(error, "see `anchor_model` in `reviv show reconstruct`"),
+            Stop::Read(error) => unreadable(&error),
+        };
+        let (squares, of) = match &self.frames {
+            Frames::Clip(rgb) => {
+                let images = rgb.frames.outer_iter().map(|frame| {
+                    Ok(Image {
+                        width: frame.shape()[1] as u32,
+                        height: frame.shape()[0] as u32,
+                        data: frame.iter().copied().collect(),
+                    })
+                });
+                let squares = anchor::labelled(network, images).map_err(failed)?;
+                let last = squares.len() - 1;
+                (squares, (0..count).map(|k| k.min(last)).collect())
+            }
+            Frames::Video { video, start } => {
+                let schedule = video.schedule();
+                let chosen = schedule.clip(schedule.nearest(*start), rate, count);
+                let mut own = chosen.clone();
+                own.sort_unstable();
+                own.dedup();
+                let decoded = video
+                    .chosen(own.clone())
+                    .map_err(|error| unreadable(&error))?;
+                let images = decoded.map(|frame| Ok(frame.map_err(Stop::Read)?.image));
+                let squares = anchor::labelled(network, images).map_err(failed)?;
+                let last = squares.len() - 1;
+                let place = |frame: &usize| own.binary_search(frame).unwrap_or(last).min(last);
+                (squares, chosen.iter().map(place).collect::<Vec<usize>>())
+            }
+        };
+        let views: Vec<_> = of.iter().map(|at| squares[*at].view()).collect();
+        ndarray::stack(Axis(0), &views).map_err(StageError::other)
+    }
+}
+
+/// What may end the labelling of an anchor.
+enum Stop {
+    Label(LabelError),
+    Read(ReadError),
+}
+
+impl From<LabelError> for Stop {
+    fn from(error: LabelError) -> Self {
+        Self::Label(error)
     }
 }
 

@@ -6,6 +6,7 @@ use crate::clip::{Clip, RGB};
 use crate::decoding::{GenerationRequest, Reconstructor};
 use crate::engine::Compute;
 use crate::experiment::{StageContext, StageError};
+use crate::labelling::DepthLabeller;
 use crate::masking::PIXELS;
 use crate::ops::predict::refused;
 use crate::reconstruction::anchor;
@@ -100,12 +101,34 @@ pub(super) fn run(
             settings.overlap
         ),
     });
-    let anchor = settings
-        .anchor
-        .as_ref()
-        .map(|path| anchor::read(path.as_ref(), frames))
-        .transpose()
-        .map_err(|error| input(error, "see `anchor` in `reviv show reconstruct`"))?;
+    let anchor = match (&settings.anchor, &settings.anchor_model) {
+        (Some(path), _) => Some(
+            anchor::read(path.as_ref(), frames)
+                .map_err(|error| input(error, "see `anchor` in `reviv show reconstruct`"))?,
+        ),
+        (None, Some(folder)) => {
+            let help = "`reviv import FILE --depth metric -o DIR` makes the folder";
+            let network = DepthLabeller::open(folder.as_ref(), &Compute::cpu())
+                .map_err(|error| input(error, help))?;
+            assumptions.push(Fact {
+                label: "Anchor".into(),
+                value: format!(
+                    "metric depth by Video Depth Anything {} ({})",
+                    network
+                        .network()
+                        .settings()
+                        .name()
+                        .unwrap_or("of other sizes"),
+                    folder.0
+                ),
+            });
+            let maps = times.take("label the anchor", || {
+                recording.anchor(&network, rate, frames)
+            })?;
+            Some(maps)
+        }
+        (None, None) => None,
+    };
     let setting = ReconstructionInfo {
         title: recording.title.clone(),
         video_rate: rate,
