@@ -5,9 +5,10 @@
 //! PATH is a Python that has PyTorch; without it reviv is measured alone. The two sides take turns, round by round, each in a
 //! process of its own with as many threads and one call to warm up, so both see the same machine and neither the other's
 //! memory. In this order: [`peer`] (asks a side), [`measure`] (what our side does when asked), the cases [`tokenizer`],
-//! [`video`], [`mget`] and [`decoding`], and [`table`] with [`machine`] (the answer). `peer/` is PyTorch's side.
+//! [`video`], [`depth`], [`mget`] and [`decoding`], and [`table`] with [`machine`] (the answer). `peer/` is PyTorch's side.
 
 mod decoding;
+mod depth;
 mod machine;
 mod measure;
 mod mget;
@@ -62,6 +63,10 @@ enum Case {
     Tokenizer,
     /// The video tokenizer: encode, decode.
     Video,
+    /// The depth network, a window of 32 frames: encoder, head.
+    Depth,
+    /// The same with a window of 8 frames.
+    DepthShort,
     /// MGET `tiny`: forward, train step.
     MgetTiny,
     /// MGET `base`: forward, train step.
@@ -88,6 +93,8 @@ impl Case {
         match self {
             Self::Tokenizer => "body tokenizer (VQ-VAE, ViT-B, 8 clips)",
             Self::Video => "video tokenizer (Cosmos DV4x8x8, 17 x 256 x 256)",
+            Self::Depth => "depth network (Video Depth Anything Small, 32 x 518 x 518)",
+            Self::DepthShort => "depth network (Video Depth Anything Small, 8 x 518 x 518)",
             Self::MgetTiny => "MGET `tiny` (8 samples, 256 + 256 tokens)",
             Self::MgetBase => "MGET `base` (1 sample, 1024 + 1024 tokens)",
             Self::Packing => "MGET `tiny` (8 samples, at most 512 + 512 tokens)",
@@ -105,7 +112,7 @@ impl Case {
             Self::MgetTiny => 5,
             Self::Tokenizer | Self::Packing | Self::DecodingFast => 3,
             Self::Video | Self::MgetBase | Self::ActivationCheckpointing => 2,
-            Self::DecodingRelease => 1,
+            Self::DepthShort | Self::Depth | Self::DecodingRelease => 1,
         }
     }
 
@@ -119,6 +126,8 @@ impl Case {
         match self {
             Self::Tokenizer => tokenizer::run(meter),
             Self::Video => video::run(meter),
+            Self::Depth => depth::run(meter, 32),
+            Self::DepthShort => depth::run(meter, 8),
             Self::MgetTiny => mget::run(meter, mget::TINY, 8, 256),
             Self::MgetBase => mget::run(meter, mget::BASE, 1, 1024),
             Self::Packing => mget::packing(meter),

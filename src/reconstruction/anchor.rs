@@ -77,9 +77,7 @@ pub fn labelled<E: From<LabelError>>(
     }
     let size = std::cell::Cell::new([0, 0]);
     let frames = frames.into_iter().map(|frame| {
-        let frame = frame?;
-        size.set([frame.height as usize, frame.width as usize]);
-        Ok(frame)
+        frame.inspect(|frame| size.set([frame.height as usize, frame.width as usize]))
     });
     let mut squares = Vec::new();
     labeller.label(frames, &LabelOptions::default(), &mut |_, metres| {

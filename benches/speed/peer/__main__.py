@@ -11,6 +11,7 @@ import sys
 import torch
 
 import decoding
+import depth
 import mget
 import tokenizer
 import video
@@ -19,6 +20,8 @@ from measure import say
 CASES = {
     "tokenizer": tokenizer.run,
     "video": video.run,
+    "depth": lambda repeats: depth.run(32, repeats),
+    "depth-short": lambda repeats: depth.run(8, repeats),
     "mget-tiny": lambda repeats: mget.run("tiny", repeats),
     "mget-base": lambda repeats: mget.run("base", repeats),
     "decoding-fast": lambda repeats: decoding.run("fast", repeats),
