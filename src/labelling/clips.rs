@@ -6,7 +6,7 @@ use ndarray::Array3;
 
 use super::{DepthLabelKind, DepthLabeller, LabelError, LabelOptions};
 use crate::clip::source::{ClipSource, Outcome};
-use crate::clip::{Clip, Depth};
+use crate::clip::{Clip, DEPTH, Depth};
 use crate::formats::ReadError;
 use crate::modality::ClipFormat;
 use crate::video::image::Image;
@@ -43,10 +43,10 @@ impl<S: ClipSource> LabelledClips<S> {
     }
 
     fn labelled(&self, mut clip: Clip) -> Result<Clip, ReadError> {
-        let Some(rgb) = &clip.rgb else {
+        let Some(rgb) = clip.rgb() else {
             return Ok(clip);
         };
-        if clip.depth.is_some() && !self.replace {
+        if clip.depth().is_some() && !self.replace {
             return Ok(clip);
         }
         let (frames, height, width, _) = rgb.frames.dim();
@@ -71,7 +71,7 @@ impl<S: ClipSource> LabelledClips<S> {
         let metres = Array3::from_shape_vec((frames, height, width), metres)
             .map_err(|error| refuse(&error))?;
         let rate = rgb.rate;
-        clip.depth = Some(Depth { rate, metres });
+        clip.set(DEPTH, Depth { rate, metres });
         Ok(clip)
     }
 }

@@ -73,7 +73,7 @@ impl Tmr {
             return Ok(None);
         };
         let truth = pairs.truth(index).map_err(load)?;
-        let (Some(predicted), Some(truth)) = (&prediction.body, &truth.body) else {
+        let (Some(predicted), Some(truth)) = (prediction.body(), truth.body()) else {
             return Ok(None);
         };
         if !whole(predicted) || !whole(truth) {
