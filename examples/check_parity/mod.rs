@@ -11,6 +11,7 @@ mod optim;
 mod structure;
 mod tmr;
 mod vda;
+mod vda_video;
 mod vq;
 
 use std::path::Path;

@@ -1,5 +1,5 @@
-//! `vda/`: depth labels. Position tables, frames to input, temporal modules, whole networks with every stage, window plans,
-//! alignment, whole videos, levels.
+//! `vda/`: depth labels. Position tables, frames to input, temporal modules, whole networks with every stage, window plans; and
+//! with [`vda_video`] alignment, whole videos, levels.
 
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -10,21 +10,17 @@ use reviv::engine::{Compute, HostTensor, Initialise, Parameters, Values, Weights
 use reviv::import::Checkpoint;
 use reviv::labelling::encoder::resample_positions;
 use reviv::labelling::head::Maps;
-use reviv::labelling::levels::levels;
 use reviv::labelling::plan::{self, plan};
 use reviv::labelling::preprocess::{
     effective_input_size, limited_size, network_size, normalised, patches, stride,
 };
-use reviv::labelling::stitch::Fit;
-use reviv::labelling::{
-    DepthLabelKind, DepthLabeller, DepthNetwork, LabelError, LabelOptions, Map, NetworkSettings,
-    Stitcher,
-};
+use reviv::labelling::{DepthNetwork, LabelError, NetworkSettings};
 use reviv::video::image::Image;
 use serde_json::Value;
 
 use super::Outcome;
 use super::report::Report;
+use super::vda_video;
 use super::vectors::{Vectors, json, stems};
 
 pub fn check(folder: &Path, report: &mut Report) -> Outcome {
@@ -36,9 +32,9 @@ pub fn check(folder: &Path, report: &mut Report) -> Outcome {
             "preprocess" => preprocess(file, report),
             "motion" => motion(file, report),
             "net" => network(file, report),
-            "windows" => windows(file, report),
-            "video" => video(file, report),
-            "labels" => labels(file, report),
+            "windows" => vda_video::windows(file, report),
+            "video" => vda_video::video(file, report),
+            "labels" => vda_video::labels(file, report),
             _ => Err("vectors of an unknown kind".into()),
         }
         .map_err(|error| format!("vda/{stem}: {error}"))?;
@@ -53,7 +49,7 @@ pub fn check(folder: &Path, report: &mut Report) -> Outcome {
     Ok(())
 }
 
-fn size(value: &Value, key: &str) -> Outcome<usize> {
+pub(super) fn size(value: &Value, key: &str) -> Outcome<usize> {
     Ok(value[key]
         .as_u64()
         .ok_or_else(|| format!("no number `{key}`"))? as usize)
@@ -90,7 +86,7 @@ fn settings(file: &Value) -> Outcome<NetworkSettings> {
 }
 
 /// The network of a file's checkpoint.
-fn built(file: &Vectors, compute: &Compute) -> Outcome<DepthNetwork> {
+pub(super) fn built(file: &Vectors, compute: &Compute) -> Outcome<DepthNetwork> {
     let settings = settings(&file.settings)?;
     let mut network = DepthNetwork::new(&Initialise::empty(compute), &settings)?;
     network.load(&used(file.checkpoint()?))?;
@@ -117,7 +113,7 @@ fn channels_first(maps: &Maps) -> (Vec<usize>, Vec<f32>) {
     (vec![frames, channels, height, width], to_host(rows))
 }
 
-fn upload(values: Vec<f32>, width: usize, compute: &Compute) -> Tensor<2> {
+pub(super) fn upload(values: Vec<f32>, width: usize, compute: &Compute) -> Tensor<2> {
     let rows = values.len() / width;
     Tensor::from_data(TensorData::new(values, [rows, width]), compute.device())
 }
@@ -142,7 +138,7 @@ fn positions(mut file: Vectors, report: &mut Report) -> Outcome {
     Ok(())
 }
 
-fn frame(bytes: &[u8], height: usize, width: usize) -> Image {
+pub(super) fn frame(bytes: &[u8], height: usize, width: usize) -> Image {
     Image {
         width: width as u32,
         height: height as u32,
@@ -202,7 +198,10 @@ fn sizes(file: &Value, report: &mut Report) -> Outcome {
     }
     for case in file["max_res"].as_array().ok_or("no limits")? {
         let (height, width) = (size(case, "height")?, size(case, "width")?);
-        let longest = size(case, "max_res")?;
+        // Without a limit there is nothing to do.
+        let Ok(longest) = size(case, "max_res") else {
+            continue;
+        };
         report.exact(
             format!("vda/max_res {width} x {height} to {longest}"),
             &limited_size(height, width, longest),
@@ -404,142 +403,6 @@ fn staged(
     add("up".to_owned(), &up);
     add("raw".to_owned(), &head.raw(&up));
     stages
-}
-
-fn kind(settings: &Value) -> Outcome<DepthLabelKind> {
-    Ok(if settings["metric"].as_bool().ok_or("no kind")? {
-        DepthLabelKind::Metric
-    } else {
-        DepthLabelKind::Relative
-    })
-}
-
-/// Stitches windows `[K, 32, size]` of maps: the video, and what each window after the first was fitted by.
-fn stitched(
-    kind: DepthLabelKind,
-    maps: &[f32],
-    from: [usize; 2],
-    size: [usize; 2],
-    frames: usize,
-) -> Outcome<(Vec<f32>, Vec<f32>)> {
-    let pixels = from[0] * from[1];
-    let mut stitcher = Stitcher::new(kind, size);
-    let (mut depth, mut fits) = (Vec::new(), Vec::new());
-    for (index, window) in maps.chunks_exact(32 * pixels).enumerate() {
-        let window = window
-            .chunks_exact(pixels)
-            .enumerate()
-            .map(|(slot, values)| {
-                let map = Map {
-                    values: values.to_vec(),
-                    size: from,
-                };
-                (slot, map)
-            })
-            .collect();
-        let fit: Fit = stitcher.push(window, Some(frames), &mut |_, map| {
-            depth.extend(map);
-            Ok::<(), LabelError>(())
-        })?;
-        if index > 0 {
-            fits.extend([fit.scale as f32, fit.shift as f32]);
-        }
-    }
-    Ok((depth, fits))
-}
-
-fn windows(mut file: Vectors, report: &mut Report) -> Outcome {
-    let kind = kind(&file.settings)?;
-    let cases = file.settings["cases"].clone();
-    for case in cases.as_array().ok_or("no cases")? {
-        let name = case["name"].as_str().ok_or("no name")?;
-        let frames = size(case, "frames")?;
-        let size = [size(case, "height")?, size(case, "width")?];
-        let input = format!("{name}.windows");
-        let maps = file.tensor(&input)?.f32(&input)?.to_vec();
-        let (depth, fits) = stitched(kind, &maps, size, size, frames)?;
-        let shape = [frames, size[0], size[1]];
-        file.compare(report, &format!("{name}.depth"), &shape, &depth)?;
-        let fitted = format!("{name}.scale_shift");
-        if file.has_output(&fitted) {
-            file.compare(report, &fitted, &[fits.len() / 2, 2], &fits)?;
-        }
-    }
-    file.finish(report);
-    Ok(())
-}
-
-fn video(mut file: Vectors, report: &mut Report) -> Outcome {
-    let compute = Compute::cpu();
-    let network = built(&file, &compute)?;
-    let kind = kind(&file.settings)?;
-    let video = file.tensor("frames")?.clone();
-    let [count, height, width, _] = video.shape[..] else {
-        return Err("frames have not four axes".into());
-    };
-    let size = [height, width];
-    let input_size = self::size(&file.settings, "input_size")?;
-    let images: Vec<Image> = video
-        .u8("frames")?
-        .chunks_exact(height * width * 3)
-        .map(|bytes| frame(bytes, height, width))
-        .collect();
-    // Every slot of every window, as the reference runs them.
-    let patch = network.settings().patch;
-    let seen = network_size(height, width, input_size, patch)?;
-    let cells = seen.map(|side| side / patch);
-    let positions = network.encoder().positions(cells);
-    let features: Vec<_> = images
-        .iter()
-        .flat_map(|image| {
-            let pixels = patches(&normalised(image, seen), seen, patch);
-            let pixels = upload(pixels, 3 * patch * patch, &compute);
-            network.encode(pixels, 1, cells, &positions)
-        })
-        .collect();
-    let all: Vec<usize> = (0..32).collect();
-    let (mut maps, mut full) = (Vec::new(), Vec::new());
-    for slots in plan(count) {
-        let window: Vec<_> = slots.iter().map(|slot| &features[*slot]).collect();
-        network.decode(&window, &all, &mut |_, values| {
-            let map = Map { values, size: seen };
-            full.extend(map.resized(size));
-            maps.extend(map.values);
-            Ok::<(), LabelError>(())
-        })?;
-    }
-    if file.has_output("windows") {
-        let shape = [plan::windows(count), 32, height, width];
-        file.compare(report, "windows", &shape, &full)?;
-    }
-    let (_, fits) = stitched(kind, &maps, seen, size, count)?;
-    if file.has_output("scale_shift") {
-        file.compare(report, "scale_shift", &[fits.len() / 2, 2], &fits)?;
-    }
-    // The result, as the product runs it.
-    let labeller = DepthLabeller::new(network, kind, &compute);
-    let mut depth = Vec::new();
-    let frames = images.into_iter().map(Ok::<Image, LabelError>);
-    labeller.label(frames, &LabelOptions { input_size }, &mut |_, map| {
-        depth.extend(map);
-        Ok(())
-    })?;
-    file.compare(report, "depth", &[count, height, width], &depth)?;
-    file.finish(report);
-    Ok(())
-}
-
-fn labels(mut file: Vectors, report: &mut Report) -> Outcome {
-    for (input, output, kind) in [
-        ("disparity", "levels_relative", DepthLabelKind::Relative),
-        ("metres", "levels_metric", DepthLabelKind::Metric),
-    ] {
-        let values = file.tensor(input)?.clone();
-        let found = levels(kind, values.f32(input)?);
-        file.compare_bytes(report, output, &values.shape, &found)?;
-    }
-    file.finish(report);
-    Ok(())
 }
 
 /// Every `.pth` or `.pt` beside a `.safetensors` of the same name holds the same tensors, bit for bit.

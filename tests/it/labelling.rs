@@ -329,7 +329,7 @@ const ROAD: &str = "
 experiment: road
 seed: 3
 stages:
-  measured: {op: clips, source: {use: world_small, world: {size: 16, rooms: 2}}, train: 4}
+  measured: {op: clips, source: {use: world_small, world: {size: 16, rooms: 2}}, train: 4, validation: 2}
   clips: {op: label_depth, clips: measured, network: network, input_size: 28, replace: true}
   tok_depth:
     op: train_tokenizer
@@ -337,8 +337,9 @@ stages:
     modality: depth
     tokenizer: video_tiny
     steps: 2
+    warmup: {steps: 1}
     batch: 1
-  tok_gaze: {op: train_tokenizer, clips: clips, modality: gaze, tokenizer: vq_temporal_small, steps: 2, batch: 2}
+  tok_gaze: {op: train_tokenizer, clips: clips, modality: gaze, tokenizer: vq_temporal_small, steps: 2, warmup: {steps: 1}, batch: 2}
   tokens: {op: tokenize, clips: clips, tokenizers: [tok_depth, tok_gaze]}
   mget:
     op: train_mget
@@ -346,6 +347,7 @@ stages:
     size: laptop_small
     masking: dirichlet
     steps: 2
+    warmup: {steps: 1}
     batch: 2
 ";
 
