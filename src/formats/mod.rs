@@ -105,6 +105,28 @@ pub(crate) fn read_whole(path: &Path, limit: u64) -> Result<Vec<u8>, FormatError
     read().map_err(|error: FormatError| error.in_file(path))
 }
 
+/// The SHA-256 of a file, in hexadecimal.
+pub(crate) fn sha256_of(path: &Path) -> std::io::Result<String> {
+    use sha2::{Digest, Sha256};
+    use std::fmt::Write as _;
+    use std::io::Read as _;
+    let mut file = std::fs::File::open(path)?;
+    let mut hasher = Sha256::new();
+    let mut buffer = vec![0; 1 << 20];
+    loop {
+        let count = file.read(&mut buffer)?;
+        if count == 0 {
+            break;
+        }
+        hasher.update(&buffer[..count]);
+    }
+    let text = String::new();
+    Ok(hasher.finalize().iter().fold(text, |mut text, byte| {
+        let _ = write!(text, "{byte:02x}");
+        text
+    }))
+}
+
 /// Whether a path that a file names stays below the folder it is joined to: neither absolute nor with `..`.
 pub(crate) fn stays_inside(path: &Path) -> bool {
     use std::path::Component;
