@@ -314,6 +314,7 @@ mod tests {
             &b"\xff\xfea\0,\0b\0\n\0"[..],
             b"\xfe\xff\0a\0,\0b",
             b"a\0,\0b\0",
+            b"\x10\0\x10\0",
         ] {
             assert!(lines(text).unwrap_err().contains("UTF-16"), "{text:?}");
             assert!(decode(text.to_vec()).unwrap_err().contains("UTF-16"));

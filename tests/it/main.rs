@@ -14,6 +14,7 @@ mod modality_plugin;
 mod odd_files;
 mod odd_videos;
 mod parity;
+mod pickles;
 mod readers_bad;
 mod reconstruct_command;
 mod reconstruction;
