@@ -2,8 +2,8 @@
 //! machines.
 //!
 //! The pixels that the released models were trained on went through that conversion: 16-bit fixed point, each product rounded
-//! down, every chroma sample serving its 2 x 2 block. The matrix is the one the stream names; a stream that names none is taken
-//! as BT.601 with limited range at every resolution, as they do.
+//! down, every chroma sample serving its 2 x 2 block. The matrix is the one that the stream names, else the container; where neither does it is
+//! BT.601 with limited range at every resolution, as they do.
 
 use crate::video::image::Image;
 use rusty_h264_common::YuvFrame;
@@ -23,16 +23,22 @@ pub enum Matrix {
     Unspecified,
     Bt601,
     Bt709,
+    /// Title 47 of the FCC's code.
+    Fcc,
+    /// SMPTE ST 240.
+    Smpte240,
     Bt2020,
 }
 
 impl Matrix {
     /// From the code in the stream.
     #[must_use]
-    pub fn from_code(code: u32) -> Self {
+    pub fn from_code(code: u8) -> Self {
         match code {
             1 => Matrix::Bt709,
+            4 => Matrix::Fcc,
             5 | 6 => Matrix::Bt601,
+            7 => Matrix::Smpte240,
             9 | 10 => Matrix::Bt2020,
             _ => Matrix::Unspecified,
         }
@@ -42,6 +48,8 @@ impl Matrix {
     fn coefficients(self) -> [i64; 4] {
         match self {
             Matrix::Unspecified | Matrix::Bt601 => [104_597, 132_201, -25_675, -53_279],
+            Matrix::Fcc => [104_448, 132_798, -24_759, -53_109],
+            Matrix::Smpte240 => [117_579, 136_230, -16_907, -35_559],
             Matrix::Bt709 => [117_489, 138_438, -13_975, -34_925],
             Matrix::Bt2020 => [110_013, 140_363, -12_277, -42_626],
         }

@@ -1,265 +1,225 @@
 //! Videos through the user's own `ffmpeg`: any container and codec it knows. It is started as a separate program and hands over
-//! its pictures through a pipe as self-describing PPM images; nothing is linked.
+//! its pictures through a pipe; nothing is linked.
+//!
+//! What is a frame, and when it is shown, is what `ffmpeg` decodes: packets may hold several pictures or none, and a seek may end
+//! anywhere. Where the packets of a container are known to be its frames, and the first ones decoded bear that out, the table
+//! of packets is the table of frames, and reading starts at the key frame before what is wanted. Everything else is decoded
+//! once when it is opened, and read from its start. In both cases every picture that comes out of the pipe carries its time
+//! stamp, by which it is known.
+
+mod process;
 
 use super::choice::FrameTimes;
 use crate::formats::ReadError;
-use crate::formats::read_error::Position;
 use crate::video::image::Image;
-use std::io::{BufRead, BufReader, Read};
-use std::path::{Path, PathBuf};
-use std::process::{Child, ChildStdout, Command, Stdio};
-use std::sync::OnceLock;
-use std::thread::JoinHandle;
+use process::{Reader, Source, Stamp};
+use std::path::Path;
+use std::sync::{Arc, Mutex, PoisonError};
 
-const MOST_PIXELS: usize = 64_000_000;
-/// Bytes of what ffmpeg complains about that are kept, the last ones.
-const COMPLAINTS: usize = 1 << 16;
-/// More frames than this are not named one by one: Linux takes no argument of more than 128 KiB.
-const MOST_NAMED: usize = 1000;
+pub use process::available;
 
-/// Whether there is an `ffmpeg` to call; asked once per process.
-pub fn available() -> bool {
-    static FOUND: OnceLock<bool> = OnceLock::new();
-    *FOUND.get_or_init(|| {
-        Command::new("ffmpeg")
-            .arg("-version")
-            .stdin(Stdio::null())
-            .stdout(Stdio::null())
-            .stderr(Stdio::null())
-            .status()
-            .is_ok_and(|status| status.success())
-    })
-}
+/// Frames that are decoded to see whether packets are frames.
+const TRIAL: usize = 48;
+/// Containers whose packets carry their own time stamps and key flags.
+const CONTAINERS: [&str; 2] = ["mov", "matroska"];
+/// Codecs that put one shown picture into each packet.
+const CODECS: [&str; 12] = [
+    "h264", "hevc", "av1", "vp9", "prores", "mjpeg", "ffv1", "dnxhd", "png", "huffyuv", "rawvideo",
+    "vvc",
+];
+/// Time stamps are microseconds; they are rounded on their way through other units.
+const ROUNDED: i64 = 2;
+/// A seek that ends too late is repeated from so many key frames earlier before the file is read from its start.
+const EARLIER: usize = 2;
 
 /// A file that `ffmpeg` reads.
 #[derive(Debug, Clone)]
 pub struct Index {
-    path: PathBuf,
-    /// Presentation time of the first frame on ffmpeg's own clock, seconds.
-    first: f64,
+    source: Arc<Source>,
+    /// Time stamp of every frame in microseconds on ffmpeg's own clock, in order of presentation.
+    stamps: Arc<Vec<i64>>,
+    /// Frames at which decoding can start, ascending; none where the file has to be read from its start.
+    keys: Option<Arc<Vec<usize>>>,
+    /// Processes that stand in the middle of a file which can only be read from its start.
+    parked: Arc<Mutex<Vec<Reader>>>,
+    /// Upright, as decoded.
+    pub size: [u32; 2],
+    /// Width to height of a pixel of the upright picture.
+    pub pixel_aspect: f64,
 }
 
-fn command(path: &Path, before_input: &[String]) -> Command {
-    let mut command = Command::new("ffmpeg");
-    command
-        .args(["-nostdin", "-v", "error"])
-        .args(before_input)
-        .arg("-i")
-        // `file:` keeps a name with a colon from being taken as a protocol, and protocols out altogether.
-        .arg({
-            let mut input = std::ffi::OsString::from("file:");
-            input.push(path);
-            input
-        })
-        .args(["-map", "0:v:0"])
-        .stdin(Stdio::null())
-        .stderr(Stdio::piped());
-    command
-}
-
-/// Reads when every frame is shown, without decoding.
-pub fn open(path: &Path) -> Result<(Index, FrameTimes), ReadError> {
-    let output = command(path, &[])
-        .args(["-c", "copy", "-f", "framecrc", "-"])
-        .output()
-        .map_err(|cause| ReadError::io(path, cause))?;
-    let text = String::from_utf8_lossy(&output.stdout);
-    let mut tick = None;
-    let mut ticks = Vec::new();
-    for line in text.lines() {
-        if let Some(base) = line.strip_prefix("#tb 0:") {
-            tick = base
-                .trim()
-                .split_once('/')
-                .and_then(|(n, d)| Some((n.parse::<f64>().ok()?, d.parse::<f64>().ok()?)));
-        } else if !line.starts_with('#') {
-            // stream, dts, pts, duration, size, checksum
-            if let Some(pts) = line
-                .split(',')
-                .nth(2)
-                .and_then(|pts| pts.trim().parse::<i64>().ok())
-            {
-                ticks.push(pts);
-            }
-        }
-    }
-    ticks.sort_unstable();
-    let (Some((numerator, denominator)), Some(&first)) = (tick, ticks.first()) else {
-        return Err(ReadError::malformed(
-            path,
-            Position::File,
-            format!("ffmpeg finds no video in it{}", complaint(&output.stderr)),
-        ));
+/// Reads when every frame is shown; of several video tracks `track` is the one that counts, by its number in the file.
+///
+/// # Errors
+/// When `ffmpeg` finds no video, or decodes no frame of it.
+pub fn open(path: &Path, track: Option<u32>) -> Result<(Index, FrameTimes), ReadError> {
+    let source = Source::new(path, track);
+    let packets = source.packets()?;
+    let trial = if packets.trusted() {
+        source.decoded(Some(TRIAL), true)?
+    } else {
+        Vec::new()
     };
-    let scale = numerator / denominator;
-    // FrameTimes works on integer ticks per second: microseconds are fine enough for any camera.
-    let micros: Vec<i64> = ticks
-        .iter()
-        .map(|pts| ((pts - first) as f64 * scale * 1e6).round() as i64)
-        .collect();
+    let borne_out = !trial.is_empty()
+        && trial.len() == packets.stamps.len().min(TRIAL)
+        && trial
+            .iter()
+            .zip(&packets.stamps)
+            .all(|(frame, stamp)| frame.time.is_some_and(|t| (t - stamp).abs() <= ROUNDED));
+    let (stamps, keys, frames) = if borne_out {
+        (packets.stamps, Some(packets.keys), trial)
+    } else {
+        let frames = source.decoded(None, false)?;
+        (repaired(&frames), None, frames)
+    };
+    let Some(first) = frames.first().copied() else {
+        return Err(source.nothing());
+    };
+    let micros: Vec<i64> = stamps.iter().map(|stamp| stamp - stamps[0]).collect();
     let index = Index {
-        path: path.to_owned(),
-        first: first as f64 * scale,
+        source: Arc::new(source),
+        stamps: Arc::new(stamps),
+        keys: keys.map(Arc::new),
+        parked: Arc::default(),
+        size: [first.width, first.height],
+        pixel_aspect: first.pixel_aspect,
     };
     Ok((index, FrameTimes::from_ticks(&micros, 1_000_000)))
 }
 
-fn complaint(stderr: &[u8]) -> String {
-    let text = String::from_utf8_lossy(stderr);
-    match text.lines().rev().find(|line| !line.trim().is_empty()) {
-        Some(line) => format!(": {}", line.trim()),
-        None => String::new(),
+/// Ascending time stamps. Streams without usable ones are evenly spaced by what is most common among them, else 25 a second, as
+/// `ffmpeg` does.
+fn repaired(frames: &[Stamp]) -> Vec<i64> {
+    let known: Vec<i64> = frames.iter().filter_map(|frame| frame.time).collect();
+    if known.len() == frames.len() && known.is_sorted_by(|a, b| a < b) {
+        return known;
     }
+    let mut steps: Vec<i64> = known.windows(2).map(|pair| pair[1] - pair[0]).collect();
+    steps.retain(|step| *step > 0);
+    steps.sort_unstable();
+    let step = steps.get(steps.len() / 2).copied().unwrap_or(40_000);
+    (0..frames.len() as i64).map(|frame| frame * step).collect()
 }
 
-/// Reads to the end and keeps the last [`COMPLAINTS`] bytes.
-fn last_bytes(mut pipe: impl Read) -> Vec<u8> {
-    let mut kept = Vec::new();
-    let mut block = [0; 4096];
-    loop {
-        match pipe.read(&mut block) {
-            Ok(0) => return kept,
-            Ok(read) => kept.extend_from_slice(&block[..read]),
-            Err(cause) if cause.kind() == std::io::ErrorKind::Interrupted => {}
-            Err(_) => return kept,
+impl Index {
+    /// The key frame to start from for `frame`, `earlier` key frames before the nearest one.
+    fn key(&self, frame: usize, earlier: usize) -> usize {
+        let Some(keys) = &self.keys else { return 0 };
+        let after = keys.partition_point(|key| *key <= frame);
+        after
+            .checked_sub(1 + earlier)
+            .map_or(0, |found| keys[found])
+    }
+
+    /// A process that has yet to hand over `frame`.
+    fn reader(&self, frame: usize) -> Result<Reader, ReadError> {
+        if self.keys.is_none() {
+            let mut parked = self.parked.lock().unwrap_or_else(PoisonError::into_inner);
+            let best = (0..parked.len())
+                .filter(|&at| parked[at].position <= frame)
+                .max_by_key(|&at| parked[at].position);
+            return match best {
+                Some(at) => Ok(parked.swap_remove(at)),
+                None => self.source.read(false, None),
+            };
         }
-        kept.drain(..kept.len().saturating_sub(COMPLAINTS));
+        for earlier in 0..=EARLIER {
+            let key = self.key(frame, earlier);
+            if key == 0 {
+                break;
+            }
+            let mut reader = self.source.read(true, Some(self.stamps[key]))?;
+            // Only what comes behind a key frame that is known is known to be whole.
+            let found = reader.peek().and_then(|stamp| self.find(stamp.time?));
+            if let Some(found) =
+                found.filter(|found| *found <= key && self.key(*found, 0) == *found)
+            {
+                reader.position = found;
+                return Ok(reader);
+            }
+        }
+        self.source.read(true, None)
     }
-}
 
-/// The filter that lets only `frames` through, counted from `first`; none where every frame is wanted or too many are.
-fn filter(frames: &[usize], first: usize, last: usize) -> Option<String> {
-    let every = frames.len() == last - first + 1;
-    (!every && frames.len() <= MOST_NAMED).then(|| {
-        let named = frames
-            .iter()
-            .map(|frame| format!("eq(n\\,{})", frame - first));
-        format!("select={}", named.collect::<Vec<_>>().join("+"))
-    })
+    fn find(&self, time: i64) -> Option<usize> {
+        let at = self.stamps.partition_point(|stamp| *stamp < time - ROUNDED);
+        (self.stamps.get(at).copied()? <= time + ROUNDED).then_some(at)
+    }
 }
 
 /// The wanted frames, decoded and turned upright by `ffmpeg`.
 #[derive(Debug)]
 pub struct Wanted {
-    path: PathBuf,
-    child: Child,
-    pipe: BufReader<ChildStdout>,
-    /// Reads what ffmpeg complains about all along: it stops when nobody does.
-    complaints: Option<JoinHandle<Vec<u8>>>,
+    index: Index,
+    /// None before the first frame and after the last.
+    reader: Option<Reader>,
     frames: Vec<usize>,
     delivered: usize,
-    /// The frame that comes next out of the pipe; none where only wanted ones come.
-    coming: Option<usize>,
 }
 
 impl Wanted {
     /// `frames` in ascending order without repetition.
-    pub fn new(
-        index: &Index,
-        schedule: &FrameTimes,
-        frames: Vec<usize>,
-    ) -> Result<Self, ReadError> {
-        let first = frames.first().copied().unwrap_or(0);
-        let last = frames.last().copied().unwrap_or(0);
-        let mut seek = Vec::new();
-        if first > 0 {
-            // Half a frame early: times are rounded on their way through the container.
-            let early = f64::midpoint(schedule.seconds(first), schedule.seconds(first - 1));
-            seek = vec!["-ss".to_owned(), format!("{:.6}", index.first + early)];
-        }
-        let mut command = command(&index.path, &seek);
-        let (count, coming) = match filter(&frames, first, last) {
-            Some(filter) => {
-                command.args(["-vf", &filter]);
-                (frames.len().max(1), None)
-            }
-            None => (last - first + 1, Some(first)),
-        };
-        command
-            .args(["-fps_mode", "passthrough", "-frames:v"])
-            .arg(count.to_string())
-            .args(["-pix_fmt", "rgb24", "-c:v", "ppm", "-f", "image2pipe", "-"])
-            .stdout(Stdio::piped());
-        let mut child = command
-            .spawn()
-            .map_err(|cause| ReadError::io(&index.path, cause))?;
-        let pipe = child
-            .stdout
-            .take()
-            .ok_or_else(|| ReadError::unsupported(&index.path, "ffmpeg gave no pipe"))?;
-        let stderr = child.stderr.take();
-        let complaints = stderr.map(|pipe| std::thread::spawn(move || last_bytes(pipe)));
-        Ok(Wanted {
-            path: index.path.clone(),
-            child,
-            pipe: BufReader::with_capacity(1 << 16, pipe),
-            complaints,
+    #[must_use]
+    pub fn new(index: &Index, frames: Vec<usize>) -> Self {
+        Wanted {
+            index: index.clone(),
+            reader: None,
             frames,
             delivered: 0,
-            coming,
-        })
-    }
-
-    /// The picture of `frame`; those that come before it are left out.
-    fn picture(&mut self, frame: usize) -> Result<Option<Image>, String> {
-        loop {
-            let image = self.read()?;
-            let Some(coming) = &mut self.coming else {
-                return Ok(image);
-            };
-            *coming += 1;
-            if *coming > frame || image.is_none() {
-                return Ok(image);
-            }
         }
     }
 
-    fn read(&mut self) -> Result<Option<Image>, String> {
-        let mut header = Vec::new();
-        // "P6\n1920 1080\n255\n"
-        for _ in 0..3 {
-            let mut limited = (&mut self.pipe).take(64);
-            let read = limited
-                .read_until(b'\n', &mut header)
-                .map_err(|cause| cause.to_string())?;
-            if read == 0 && header.is_empty() {
-                return Ok(None);
-            }
+    fn picture(&mut self, frame: usize) -> Result<Image, ReadError> {
+        let found = self.next_picture(frame);
+        let sought = self.reader.as_ref().is_some_and(|reader| reader.sought);
+        if found.is_ok() || !sought {
+            return found;
         }
-        let text = String::from_utf8_lossy(&header);
-        let mut words = text.split_ascii_whitespace();
-        let (Some("P6"), Some(width), Some(height), Some("255")) = (
-            words.next(),
-            words.next().and_then(|word| word.parse::<usize>().ok()),
-            words.next().and_then(|word| word.parse::<usize>().ok()),
-            words.next(),
-        ) else {
-            return Err("ffmpeg sent something that is no picture".to_owned());
+        // A decoder that started in the middle may leave frames out that it has when it started at the beginning.
+        self.reader = Some(self.index.source.read(true, None)?);
+        self.next_picture(frame)
+    }
+
+    fn next_picture(&mut self, frame: usize) -> Result<Image, ReadError> {
+        // A later start is worth a new process when a key frame lies between.
+        let far = |reader: &Reader| {
+            let key = self.index.key(frame, 0);
+            key > reader.position + TRIAL
         };
-        if width == 0 || height == 0 || width.saturating_mul(height) > MOST_PIXELS {
-            return Err(format!("a picture of {width} x {height} pixels"));
+        if self.reader.as_ref().is_none_or(far) {
+            self.reader = None;
+            self.reader = Some(self.index.reader(frame)?);
         }
-        let mut data = vec![0; width * height * 3];
-        self.pipe
-            .read_exact(&mut data)
-            .map_err(|_| "ffmpeg stopped in the middle of a picture".to_owned())?;
-        Ok(Some(Image {
-            width: width as u32,
-            height: height as u32,
-            data,
-        }))
-    }
-
-    fn failure(&mut self, frame: usize, reason: &str) -> ReadError {
-        let _ = self.child.kill();
-        let complaints = self.complaints.take();
-        let stderr = complaints.and_then(|thread| thread.join().ok());
-        let stderr = stderr.unwrap_or_default();
-        ReadError::malformed(
-            &self.path,
-            Position::Frame(frame as u64),
-            format!("{reason}{}", complaint(&stderr)),
-        )
+        let Some(reader) = &mut self.reader else {
+            return Err(self.index.source.nothing());
+        };
+        loop {
+            let missing = "ffmpeg decodes no such frame";
+            let Some(stamp) = reader.peek() else {
+                return Err(reader.failure(frame, missing));
+            };
+            if self.index.keys.is_some() {
+                match stamp.time.and_then(|time| self.index.find(time)) {
+                    Some(found) => reader.position = found,
+                    // A picture that is none of the table's.
+                    None => {
+                        reader.skip().map_err(|why| reader.failure(frame, &why))?;
+                        continue;
+                    }
+                }
+            }
+            if reader.position > frame {
+                return Err(reader.failure(frame, missing));
+            }
+            let asked = reader.position == frame;
+            if asked {
+                let image = reader.image().map_err(|why| reader.failure(frame, &why))?;
+                reader.position += 1;
+                return Ok(image);
+            }
+            reader.skip().map_err(|why| reader.failure(frame, &why))?;
+            reader.position += 1;
+        }
     }
 }
 
@@ -269,24 +229,37 @@ impl Iterator for Wanted {
     fn next(&mut self) -> Option<Self::Item> {
         let frame = *self.frames.get(self.delivered)?;
         self.delivered += 1;
-        Some(match self.picture(frame) {
-            Ok(Some(image)) => Ok((frame, image)),
-            Ok(None) => {
-                self.delivered = self.frames.len();
-                Err(self.failure(frame, "ffmpeg decodes no such frame"))
-            }
-            Err(reason) => {
-                self.delivered = self.frames.len();
-                Err(self.failure(frame, &reason))
-            }
-        })
+        let picture = self.picture(frame);
+        if picture.is_err() {
+            self.reader = None;
+            self.delivered = self.frames.len();
+        }
+        Some(picture.map(|image| (frame, image)))
     }
 }
 
 impl Drop for Wanted {
     fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
+        let Some(reader) = self.reader.take() else {
+            return;
+        };
+        if self.index.keys.is_some() || reader.position >= self.index.stamps.len() {
+            return;
+        }
+        // Whoever reads on in this file need not start again.
+        let most = std::thread::available_parallelism().map_or(2, usize::from);
+        let mut parked = self
+            .index
+            .parked
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner);
+        parked.push(reader);
+        if parked.len() > most {
+            let first = (0..parked.len()).min_by_key(|&at| parked[at].position);
+            if let Some(first) = first {
+                parked.swap_remove(first);
+            }
+        }
     }
 }
 
@@ -295,19 +268,22 @@ mod tests {
     use super::*;
 
     #[test]
-    fn all_complaints_are_read_and_the_last_of_them_kept() {
-        let said = [vec![b'a'; 3 * COMPLAINTS], b"the end".to_vec()].concat();
-        let kept = last_bytes(said.as_slice());
-        assert_eq!(kept.len(), COMPLAINTS);
-        assert!(kept.ends_with(b"aathe end"));
-        assert_eq!(last_bytes(&b"short"[..]), b"short");
-    }
-
-    #[test]
-    fn frames_are_named_only_where_they_are_few_and_have_gaps() {
-        assert_eq!(filter(&[4, 6], 4, 6).unwrap(), "select=eq(n\\,0)+eq(n\\,2)");
-        assert_eq!(filter(&[4, 5, 6], 4, 6), None);
-        let many: Vec<usize> = (0..=MOST_NAMED).map(|k| 2 * k).collect();
-        assert_eq!(filter(&many, 0, 2 * MOST_NAMED), None);
+    fn streams_without_usable_times_are_evenly_spaced() {
+        let frames = |times: &[Option<i64>]| -> Vec<Stamp> {
+            times
+                .iter()
+                .map(|time| Stamp {
+                    time: *time,
+                    width: 2,
+                    height: 2,
+                    pixel_aspect: 1.0,
+                })
+                .collect()
+        };
+        let good = [Some(5), Some(20), Some(70)];
+        assert_eq!(repaired(&frames(&good)), [5, 20, 70]);
+        let stuck = [Some(0), Some(40), Some(40), Some(80), None];
+        assert_eq!(repaired(&frames(&stuck)), [0, 40, 80, 120, 160]);
+        assert_eq!(repaired(&frames(&[None, None])), [0, 40_000]);
     }
 }

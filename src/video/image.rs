@@ -44,6 +44,17 @@ impl Turn {
         }
     }
 
+    /// Degrees clockwise.
+    #[must_use]
+    pub fn degrees(self) -> u32 {
+        match self {
+            Turn::None => 0,
+            Turn::Clockwise => 90,
+            Turn::Half => 180,
+            Turn::CounterClockwise => 270,
+        }
+    }
+
     /// Where the pixel (u, v) of a `width` x `height` picture goes.
     #[must_use]
     pub fn pixel(self, u: f64, v: f64, width: f64, height: f64) -> (f64, f64) {
@@ -72,6 +83,56 @@ impl Turn {
             Turn::None | Turn::Half => (width, height),
             Turn::Clockwise | Turn::CounterClockwise => (height, width),
         }
+    }
+}
+
+/// How a stored picture comes upright: mirrored left to right first, then turned.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Orientation {
+    pub mirrored: bool,
+    pub turn: Turn,
+}
+
+impl Orientation {
+    /// Of the eight that Exif numbers; as stored for any other number.
+    #[must_use]
+    pub fn from_exif(code: u32) -> Self {
+        let (mirrored, turn) = match code {
+            2 => (true, Turn::None),
+            3 => (false, Turn::Half),
+            4 => (true, Turn::Half),
+            5 => (true, Turn::CounterClockwise),
+            6 => (false, Turn::Clockwise),
+            7 => (true, Turn::Clockwise),
+            8 => (false, Turn::CounterClockwise),
+            _ => (false, Turn::None),
+        };
+        Orientation { mirrored, turn }
+    }
+
+    /// From a display matrix, x' = a x + c y and y' = b x + d y; none where it turns by more than a degree beside a quarter.
+    /// A matrix of rank one or zero says nothing.
+    #[must_use]
+    pub fn from_matrix([a, b, c, d]: [i32; 4]) -> Option<Self> {
+        let [a, b, c, d] = [a, b, c, d].map(f64::from);
+        let (x, y) = (a.hypot(c), b.hypot(d));
+        if x == 0.0 || y == 0.0 {
+            return Some(Self::default());
+        }
+        let (a, b, c, d) = (a / x, b / y, c / x, d / y);
+        let mirrored = a * d - b * c < 0.0;
+        // Undo the mirror: what is left is a turn.
+        let a = if mirrored { -a } else { a };
+        let b = if mirrored { -b } else { b };
+        let degrees = b.atan2(a).to_degrees();
+        let quarters = (degrees / 90.0).round();
+        if (degrees - 90.0 * quarters).abs() > 1.0 {
+            return None;
+        }
+        Some(Orientation {
+            mirrored,
+            turn: Turn::from_degrees((quarters as i32).rem_euclid(4) as u32 * 90),
+        })
     }
 }
 
@@ -185,12 +246,42 @@ impl Image {
         }
     }
 
+    /// The upright picture.
+    #[must_use]
+    pub fn upright(mut self, orientation: Orientation) -> Self {
+        if orientation.mirrored {
+            for row in self.data.chunks_exact_mut(3 * self.width.max(1) as usize) {
+                let (pixels, _) = row.as_chunks_mut::<3>();
+                pixels.reverse();
+            }
+        }
+        self.turned(orientation.turn)
+    }
+
+    /// The picture with square pixels, from pixels `aspect` times as wide as high; no side gets shorter.
+    #[must_use]
+    pub fn with_square_pixels(self, aspect: f64) -> Self {
+        let (width, height) = squared(self.width, self.height, aspect);
+        self.resized(width, height)
+    }
+
+    /// The picture at another size, by area.
+    #[must_use]
+    pub fn resized(self, width: u32, height: u32) -> Self {
+        if (width, height) == (self.width, self.height) {
+            return self;
+        }
+        super::resize::area(&self, width, height)
+    }
+
     /// Short side to `side` by area interpolation (the long side rounded), then the centre square: the geometry of every clip.
     #[must_use]
     pub fn square(&self, side: u32) -> Self {
         let fit = SquareFit::new(self.width, self.height, side);
-        let resized = super::resize::area(self, fit.resized.0, fit.resized.1);
-        resized.crop(fit.left, fit.top, side, side)
+        if fit.resized == (self.width, self.height) {
+            return self.clone().crop(fit.left, fit.top, side, side);
+        }
+        super::resize::window(self, fit.resized, (fit.left, fit.top), (side, side))
     }
 
     fn crop(self, left: u32, top: u32, width: u32, height: u32) -> Self {
@@ -208,6 +299,24 @@ impl Image {
             data,
         }
     }
+}
+
+/// The size that a picture whose pixels are `aspect` times as wide as high has with square ones. A picture that would become
+/// absurdly long is left as it is.
+#[must_use]
+pub fn squared(width: u32, height: u32, aspect: f64) -> (u32, u32) {
+    if !(aspect.is_finite() && (1.0 / 16.0..=16.0).contains(&aspect)) {
+        return (width, height);
+    }
+    let (wide, high) = if aspect > 1.0 {
+        ((f64::from(width) * aspect).round() as u32, height)
+    } else {
+        (width, (f64::from(height) / aspect).round() as u32)
+    };
+    if check_size(wide, high).is_err() {
+        return (width, height);
+    }
+    (wide, high)
 }
 
 /// How a picture becomes a square of `side` pixels: what happens to pixels, for intrinsics and gaze.
@@ -307,6 +416,53 @@ mod tests {
                 }
             }
         }
+    }
+
+    /// Corner by corner, as the tables of Exif and of the display matrix draw them.
+    #[test]
+    fn the_eight_orientations_move_corners_as_exif_and_matrices_say() {
+        let one = 1 << 16;
+        // Top left, top right, bottom left, bottom right of the stored picture.
+        let stored = [10, 20, 30, 40];
+        for (code, matrix, upright) in [
+            (1, [one, 0, 0, one], [10, 20, 30, 40]),
+            (2, [-one, 0, 0, one], [20, 10, 40, 30]),
+            (3, [-one, 0, 0, -one], [40, 30, 20, 10]),
+            (4, [one, 0, 0, -one], [30, 40, 10, 20]),
+            (5, [0, one, one, 0], [10, 30, 20, 40]),
+            (6, [0, one, -one, 0], [30, 10, 40, 20]),
+            (7, [0, -one, -one, 0], [40, 20, 30, 10]),
+            (8, [0, -one, one, 0], [20, 40, 10, 30]),
+        ] {
+            let orientation = Orientation::from_exif(code);
+            assert_eq!(
+                Orientation::from_matrix(matrix),
+                Some(orientation),
+                "{code}"
+            );
+            let image = Image {
+                width: 2,
+                height: 2,
+                data: stored.iter().flat_map(|v| [*v; 3]).collect(),
+            };
+            let found: Vec<u8> = image.upright(orientation).data;
+            let found: Vec<u8> = found.chunks_exact(3).map(|pixel| pixel[0]).collect();
+            assert_eq!(found, upright, "{code}");
+        }
+        assert_eq!(Orientation::from_matrix([one, one, -one, one]), None);
+        assert_eq!(
+            Orientation::from_matrix([0; 4]),
+            Some(Orientation::default())
+        );
+    }
+
+    #[test]
+    fn pixels_become_square_by_lengthening_one_side() {
+        assert_eq!(squared(72, 64, 4.0 / 3.0), (96, 64));
+        assert_eq!(squared(64, 72, 0.75), (64, 96));
+        assert_eq!(squared(1920, 1080, 1.0), (1920, 1080));
+        assert_eq!(squared(1920, 1080, 1e-9), (1920, 1080));
+        assert_eq!(squared(1920, 1080, f64::NAN), (1920, 1080));
     }
 
     #[test]

@@ -2,25 +2,28 @@
 //!
 //! [`Video`] is opened once, knows when each of its frames is shown, and decodes any of them from any thread with memory that does
 //! not depend on its length. In reading order: [`choice`] (which frames make a clip), [`mp4`] (where the samples are),
-//! [`h264`] and [`embedded`] (pictures), [`colour`] (RGB), [`folder`], [`ffmpeg`]; [`image`]: single
-//! pictures, and the resize of every clip.
+//! [`h264`] and [`embedded`] (pictures), [`colour`] (RGB), [`folder`] and [`exif`], [`ffmpeg`]; `parallel`: the
+//! squares of a clip on several cores; [`image`]: single pictures, and the resize of every clip.
 
 pub mod choice;
 pub mod colour;
 pub mod embedded;
+pub mod exif;
 pub mod ffmpeg;
 pub mod folder;
 pub mod h264;
 pub mod image;
 pub mod mp4;
+mod parallel;
 mod resize;
 
 pub use choice::FrameTimes;
+pub use parallel::Squares;
 
 use crate::clip::Rgb;
 use crate::formats::ReadError;
 use crate::formats::read_error::Position;
-use crate::video::image::Image;
+use crate::video::image::{Image, Turn};
 use ndarray::{Array3, Array4};
 use std::fs::File;
 use std::io::Read;
@@ -37,6 +40,17 @@ pub struct VideoSettings {
     pub decoder: DecoderChoice,
     /// Frames per second of a folder of pictures, which does not say it itself.
     pub folder_fps: f64,
+}
+
+impl VideoSettings {
+    /// The default settings with this decoder.
+    #[must_use]
+    pub fn by(decoder: DecoderChoice) -> Self {
+        VideoSettings {
+            decoder,
+            ..VideoSettings::default()
+        }
+    }
 }
 
 impl Default for VideoSettings {
@@ -59,6 +73,7 @@ impl Default for VideoSettings {
     serde::Serialize,
     serde::Deserialize,
     schemars::JsonSchema,
+    clap::ValueEnum,
 )]
 #[serde(rename_all = "snake_case")]
 pub enum DecoderChoice {
@@ -71,10 +86,22 @@ pub enum DecoderChoice {
     Ffmpeg,
 }
 
+impl DecoderChoice {
+    /// As it is written in settings.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            DecoderChoice::Auto => "auto",
+            DecoderChoice::Embedded => "embedded",
+            DecoderChoice::Ffmpeg => "ffmpeg",
+        }
+    }
+}
+
 /// What a video is.
 #[derive(Debug, Clone, PartialEq)]
 pub struct VideoInfo {
-    /// Pixels of the upright picture, rotation applied.
+    /// Square pixels of the upright picture, rotation applied.
     pub width: u32,
     pub height: u32,
     /// Frames per second; the mean where the rate varies.
@@ -83,13 +110,28 @@ pub struct VideoInfo {
     pub frames: usize,
     /// Degrees clockwise by which the stored pictures are turned (already applied to every frame that comes out).
     pub rotation: u32,
+    /// Stored pictures are mirrored left to right (already undone).
+    pub mirrored: bool,
+    /// Width to height of a stored pixel, upright; every frame that comes out has square ones.
+    pub pixel_aspect: f64,
     /// Frames are not evenly spaced.
     pub variable_rate: bool,
     /// `embedded H.264`, `ffmpeg` or `folder of pictures`.
     pub decoder: &'static str,
+    /// Why the embedded decoder left an mp4 to `ffmpeg`.
+    pub beyond_embedded: Option<String>,
 }
 
 impl VideoInfo {
+    /// The decoder, and why it was not the embedded one.
+    #[must_use]
+    pub fn read_by(&self) -> String {
+        match &self.beyond_embedded {
+            Some(why) => format!("{} ({why})", self.decoder),
+            None => self.decoder.to_owned(),
+        }
+    }
+
     /// Seconds from the first frame to the end of the last.
     #[must_use]
     pub fn seconds(&self) -> f64 {
@@ -111,6 +153,16 @@ enum Backing {
     Embedded(Arc<embedded::Index>),
     Folder(Arc<Vec<PathBuf>>),
     Ffmpeg(ffmpeg::Index),
+}
+
+/// What became of an mp4.
+enum Mp4 {
+    Video(Box<Video>),
+    /// Its video track, and why the embedded decoder cannot read it; none where it was not asked.
+    Beyond {
+        id: u32,
+        why: Option<String>,
+    },
 }
 
 /// One upright frame.
@@ -147,85 +199,97 @@ impl Video {
             .read(&mut head)
             .map_err(|cause| ReadError::io(path, cause))?;
         drop(file);
-        let reason = if settings.decoder == DecoderChoice::Ffmpeg {
-            String::new()
-        } else if !mp4::sniff(&head[..read]) {
-            "not an mp4".to_owned()
-        } else {
-            match Self::open_mp4(path)? {
-                Ok(video) => return Ok(video),
-                Err(reason) => reason,
+        let is_mp4 = mp4::sniff(&head[..read]);
+        let (mut reason, mut track) = (None, None);
+        if is_mp4 {
+            match Self::open_mp4(path, settings.decoder) {
+                Ok(Mp4::Video(video)) => return Ok(*video),
+                Ok(Mp4::Beyond { id, why }) => (track, reason) = (Some(id), why),
+                // A box that is not understood may be one that ffmpeg knows; it finds the track itself.
+                Err(ReadError::Unsupported { reason: why, .. }) => reason = Some(why),
+                Err(ReadError::Malformed { .. }) if settings.decoder == DecoderChoice::Ffmpeg => {}
+                Err(error) => return Err(error),
             }
-        };
+        }
         if settings.decoder == DecoderChoice::Embedded {
+            let reason = reason.unwrap_or_else(|| "not an mp4".to_owned());
             return Err(ReadError::unsupported(
                 path,
                 format!("{reason}, which the embedded decoder does not read"),
             ));
         }
         if !ffmpeg::available() {
-            let what = if reason.is_empty() {
-                "`ffmpeg` was asked for".to_owned()
-            } else {
-                reason
+            let what = match (settings.decoder, reason) {
+                (DecoderChoice::Ffmpeg, _) => "`ffmpeg` was asked for".to_owned(),
+                (_, Some(reason)) => reason,
+                (_, None) => "not an mp4".to_owned(),
             };
             return Err(ReadError::unsupported(
                 path,
                 format!("{what}; with `ffmpeg` on the PATH it can be read; or {CONVERT}"),
             ));
         }
-        Self::open_ffmpeg(path)
+        let mut video = Self::open_ffmpeg(path, track)?;
+        video.info.beyond_embedded = reason;
+        Ok(video)
     }
 
-    /// Inner error: why the embedded decoder cannot read a file that is otherwise fine.
-    fn open_mp4(path: &Path) -> Result<Result<Self, String>, ReadError> {
+    fn open_mp4(path: &Path, decoder: DecoderChoice) -> Result<Mp4, ReadError> {
         let track = mp4::read(path)?;
-        let Some(configuration) = &track.avc_configuration else {
-            return Ok(Err(format!(
-                "video of codec `{}`",
-                track.codec.escape_ascii()
-            )));
-        };
-        let configuration = h264::Configuration::parse(configuration)
-            .map_err(|reason| ReadError::malformed(path, Position::File, reason))?;
-        if let Some(reason) = configuration.beyond_embedded() {
-            return Ok(Err(reason));
+        let id = track.id;
+        if decoder == DecoderChoice::Ffmpeg {
+            return Ok(Mp4::Beyond { id, why: None });
         }
-        let sequence = configuration.sequence;
-        let rotation = track.rotation;
-        let (index, schedule) = embedded::Index::new(path, track, configuration)?;
-        let (width, height) = index.turn.size(sequence.width, sequence.height);
-        Ok(Ok(Video {
+        let (index, schedule) = match embedded::Index::new(path, track)? {
+            Ok(found) => found,
+            Err(why) => return Ok(Mp4::Beyond { id, why: Some(why) }),
+        };
+        let orientation = index.orientation;
+        let [width, height] = index.size;
+        let (width, height) = orientation.turn.size(width, height);
+        let pixel_aspect = if matches!(orientation.turn, Turn::Clockwise | Turn::CounterClockwise) {
+            1.0 / index.pixel_aspect
+        } else {
+            index.pixel_aspect
+        };
+        let (width, height) = image::squared(width, height, pixel_aspect);
+        Ok(Mp4::Video(Box::new(Video {
             path: path.to_owned(),
             info: VideoInfo {
                 width,
                 height,
                 fps: schedule.fps(),
                 frames: schedule.frames(),
-                rotation,
+                rotation: orientation.turn.degrees(),
+                mirrored: orientation.mirrored,
+                pixel_aspect,
                 variable_rate: matches!(schedule, FrameTimes::Variable { .. }),
                 decoder: "embedded H.264",
+                beyond_embedded: None,
             },
             schedule: Arc::new(schedule),
             pictures: Backing::Embedded(Arc::new(index)),
-        }))
+        })))
     }
 
-    fn open_ffmpeg(path: &Path) -> Result<Self, ReadError> {
-        let (index, schedule) = ffmpeg::open(path)?;
-        let (_, first) = ffmpeg::Wanted::new(&index, &schedule, vec![0])?
-            .next()
-            .ok_or_else(|| ReadError::malformed(path, Position::Frame(0), "no picture"))??;
+    fn open_ffmpeg(path: &Path, track: Option<u32>) -> Result<Self, ReadError> {
+        let (index, schedule) = ffmpeg::open(path, track)?;
+        let pixel_aspect = index.pixel_aspect;
+        let [width, height] = index.size;
+        let (width, height) = image::squared(width, height, pixel_aspect);
         Ok(Video {
             path: path.to_owned(),
             info: VideoInfo {
-                width: first.width,
-                height: first.height,
+                width,
+                height,
                 fps: schedule.fps(),
                 frames: schedule.frames(),
                 rotation: 0,
+                mirrored: false,
+                pixel_aspect,
                 variable_rate: matches!(schedule, FrameTimes::Variable { .. }),
                 decoder: "ffmpeg",
+                beyond_embedded: None,
             },
             schedule: Arc::new(schedule),
             pictures: Backing::Ffmpeg(index),
@@ -246,8 +310,11 @@ impl Video {
                 fps,
                 frames: files.len(),
                 rotation: 0,
+                mirrored: false,
+                pixel_aspect: 1.0,
                 variable_rate: false,
                 decoder: "folder of pictures",
+                beyond_embedded: None,
             },
             schedule: Arc::new(FrameTimes::Constant {
                 fps,
@@ -292,17 +359,16 @@ impl Video {
         frames.dedup();
         let inner = match &self.pictures {
             Backing::Embedded(index) => Inner::Embedded(
-                Box::new(embedded::Wanted::new(Arc::clone(index), frames)?),
+                Box::new(embedded::Wanted::new(Arc::clone(index), &frames)?),
                 Arc::clone(index),
             ),
             Backing::Folder(files) => Inner::Folder(Arc::clone(files), frames.into_iter()),
-            Backing::Ffmpeg(index) if !frames.is_empty() => Inner::Ffmpeg(Box::new(
-                ffmpeg::Wanted::new(index, &self.schedule, frames)?,
-            )),
-            Backing::Ffmpeg(_) => Inner::Folder(Arc::default(), Vec::new().into_iter()),
+            Backing::Ffmpeg(index) => Inner::Ffmpeg(Box::new(ffmpeg::Wanted::new(index, frames))),
         };
         Ok(Frames {
             schedule: Arc::clone(&self.schedule),
+            pixel_aspect: self.info.pixel_aspect,
+            size: (self.info.width, self.info.height),
             inner,
         })
     }
@@ -357,6 +423,8 @@ impl Video {
 #[derive(Debug)]
 pub struct Frames {
     schedule: Arc<FrameTimes>,
+    pixel_aspect: f64,
+    size: (u32, u32),
     inner: Inner,
 }
 
@@ -372,9 +440,9 @@ impl Iterator for Frames {
 
     fn next(&mut self) -> Option<Self::Item> {
         let result = match &mut self.inner {
-            Inner::Embedded(wanted, index) => wanted.next()?.map(|(frame, picture)| {
-                let image = colour::to_rgb(&picture, index.configuration.sequence.colour);
-                (frame, image.turned(index.turn))
+            Inner::Embedded(wanted, index) => wanted.next()?.map(|(frame, picture, colours)| {
+                let image = colour::to_rgb(&picture, colours);
+                (frame, image.upright(index.orientation))
             }),
             Inner::Folder(files, frames) => {
                 let frame = frames.next()?;
@@ -382,10 +450,20 @@ impl Iterator for Frames {
             }
             Inner::Ffmpeg(wanted) => wanted.next()?,
         };
-        Some(result.map(|(index, image)| Frame {
-            index,
-            seconds: self.schedule.seconds(index),
-            image,
+        let is_folder = matches!(self.inner, Inner::Folder(..));
+        Some(result.map(|(index, image)| {
+            let image = image.with_square_pixels(self.pixel_aspect);
+            // Where the size of a stream changes on the way, the first one counts.
+            let image = if is_folder {
+                image
+            } else {
+                image.resized(self.size.0, self.size.1)
+            };
+            Frame {
+                index,
+                seconds: self.schedule.seconds(index),
+                image,
+            }
         }))
     }
 }

@@ -1,43 +1,58 @@
-//! The part of ISO base media files (mp4, mov) that a video reader needs: the first video track's codec configuration and, for
-//! every sample, where its bytes are and when it is shown. Fragmented files and edit lists included.
+//! The part of ISO base media files (mp4, mov) that a video reader needs: how the video track is coded and, for every sample,
+//! where its bytes are and when it is shown. Fragmented files, edit lists and several sample descriptions included.
 //!
 //! The reader is our own because files come from anywhere: every count is checked against the file before anything is
 //! allocated for it, nothing here can panic, and only the index is held in memory, never the media.
 
 mod boxes;
+mod edits;
+mod entry;
 mod fragment;
 mod samples;
+
+pub use edits::{Edit, Shown};
+pub use entry::SampleEntry;
 
 use boxes::{Boxes, be32, be64};
 use fragment::Defaults;
 
 use crate::formats::ReadError;
 use crate::formats::read_error::Position;
+use crate::video::image::Orientation;
 use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::Path;
 
-/// A sample table entry is 24 bytes in memory; a file whose samples are smaller than this on average is not a video, and
-/// refusing it keeps the index below the size of the file.
-const SMALLEST_MEAN_SAMPLE: u64 = 24;
+/// Every sample of a movie takes at least four bytes of the file, in its table of sizes or in the media; with 24 bytes a sample,
+/// the index stays below six times the size of the file.
+const SMALLEST_SAMPLE: u64 = 4;
 /// Boxes inside boxes.
 const DEEPEST: usize = 12;
 
-/// The first video track of a file.
+/// The video track of a file: the first one that is switched on, pictures of chapters and covers aside.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Track {
-    /// Four characters of the sample description: `avc1`, `hvc1`, `av01`, ...
-    pub codec: [u8; 4],
-    /// The payload of `avcC`, when there is one.
-    pub avc_configuration: Option<Vec<u8>>,
-    /// Degrees clockwise by which the decoded picture has to be turned for display: 0, 90, 180 or 270.
-    pub rotation: u32,
+    pub id: u32,
+    /// Players show it.
+    pub enabled: bool,
+    /// At least one.
+    pub entries: Vec<SampleEntry>,
+    /// How decoded pictures come upright; none where that is more than quarter turns and a mirror.
+    pub orientation: Option<Orientation>,
+    /// Width to height of a pixel by the matrix, which may stretch pictures.
+    pub stretch: Option<f64>,
+    /// Pixels by the header of the track, before it is turned; 0 where it says nothing.
+    pub size: [u32; 2],
     /// Ticks per second of [`Sample::time`].
     pub timescale: u32,
+    /// Ticks per second of [`Edit::duration`].
+    pub movie_timescale: u32,
     /// In decoding order.
     pub samples: Vec<Sample>,
-    /// First tick that is shown (edit list); earlier samples are decoded but not part of the video.
-    pub first_shown: i64,
+    /// Empty: everything is shown.
+    pub edits: Vec<Edit>,
+    /// Samples come in movie fragments.
+    pub fragmented: bool,
 }
 
 /// One coded picture.
@@ -47,8 +62,10 @@ pub struct Sample {
     pub offset: u64,
     /// Presentation time in ticks.
     pub time: i64,
-    /// Bytes.
+    /// Bytes; a sample of none is no picture, the one before stays on.
     pub size: u32,
+    /// Index into [`Track::entries`].
+    pub entry: u16,
     /// Decoding can start here.
     pub sync: bool,
 }
@@ -62,7 +79,7 @@ pub fn sniff(head: &[u8]) -> bool {
         )
 }
 
-/// Reads the index of the first video track.
+/// Reads the index of the video track.
 pub fn read(path: &Path) -> Result<Track, ReadError> {
     let file = File::open(path).map_err(|cause| ReadError::io(path, cause))?;
     let len = file
@@ -78,7 +95,12 @@ pub fn read(path: &Path) -> Result<Track, ReadError> {
     let mut fragments = Defaults::default();
     let mut at = 0;
     while at + 8 <= len {
-        let (kind, header, size) = top.box_header(at)?;
+        let (kind, header, size) = match top.box_header(at) {
+            Ok(found) => found,
+            // What cameras append after the last box is none. Media that is cut off shows when samples are compared with the file.
+            Err((kind, _)) if track.is_some() && &kind != b"moof" => break,
+            Err((_, error)) => return Err(error),
+        };
         match &kind {
             b"moov" if track.is_none() => {
                 let bytes = top.payload(at + header, size - header)?;
@@ -105,6 +127,7 @@ pub fn read(path: &Path) -> Result<Track, ReadError> {
                         "a movie fragment before the movie header",
                     )
                 })?;
+                track.fragmented = true;
                 reader.fragment(&bytes, at, track, &mut fragments)?;
             }
             _ => {}
@@ -158,8 +181,10 @@ struct TopLevel<'a> {
 
 impl TopLevel<'_> {
     /// Kind, size of the header, size of the box.
-    fn box_header(&mut self, at: u64) -> Result<([u8; 4], u64, u64), ReadError> {
-        let bytes = self.payload(at, 16.min(self.len - at))?;
+    fn box_header(&mut self, at: u64) -> Result<([u8; 4], u64, u64), ([u8; 4], ReadError)> {
+        let bytes = self
+            .payload(at, 16.min(self.len - at))
+            .map_err(|error| (*b"moof", error))?;
         let short = u64::from(be32(&bytes, 0).unwrap_or(0));
         let kind = [bytes[4], bytes[5], bytes[6], bytes[7]];
         let (header, size) = match short {
@@ -168,7 +193,7 @@ impl TopLevel<'_> {
             size => (8, size),
         };
         if size < header || size > self.len - at {
-            return Err(ReadError::malformed(
+            let error = ReadError::malformed(
                 self.path,
                 Position::Offset(at),
                 format!(
@@ -176,7 +201,8 @@ impl TopLevel<'_> {
                     kind.escape_ascii(),
                     self.len - at
                 ),
-            ));
+            );
+            return Err((kind, error));
         }
         Ok((kind, header, size))
     }

@@ -64,15 +64,41 @@ pub fn area(image: &Image, width: u32, height: u32) -> Image {
     if (image.width, image.height) == (width, height) {
         return image.clone();
     }
-    let columns = shares(image.width, width);
-    let rows = shares(image.height, height);
+    window(image, (width, height), (0, 0), (width, height))
+}
+
+/// The part of `size` pixels from `left` and `top` on of the picture resized to `resized`, without the rest.
+#[must_use]
+pub fn window(
+    image: &Image,
+    resized: (u32, u32),
+    (left, top): (u32, u32),
+    (width, height): (u32, u32),
+) -> Image {
+    let of = |all: Vec<Vec<Share>>, first: u32, count: u32| -> Vec<Vec<Share>> {
+        all.into_iter()
+            .skip(first as usize)
+            .take(count as usize)
+            .collect()
+    };
+    let mut columns = of(shares(image.width, resized.0), left, width);
+    let rows = of(shares(image.height, resized.1), top, height);
+    // Only these columns of the source are looked at.
+    let ends = |shares: &Vec<Share>| shares.iter().map(|share| share.index).collect::<Vec<_>>();
+    let touched: Vec<usize> = columns.iter().flat_map(ends).collect();
+    let first = touched.iter().min().copied().unwrap_or(0);
+    let last = touched.iter().max().copied().unwrap_or(0);
+    for share in columns.iter_mut().flatten() {
+        share.index -= first;
+    }
     let stride = image.width as usize * 3;
+    let used = (last + 1 - first) * 3;
     let mut data = Vec::with_capacity(width as usize * height as usize * 3);
-    let mut sums = vec![0.0_f32; stride];
+    let mut sums = vec![0.0_f32; used];
     for row in &rows {
         sums.fill(0.0);
         for share in row {
-            let line = &image.data[share.index * stride..][..stride];
+            let line = &image.data[share.index * stride + first * 3..][..used];
             for (sum, value) in sums.iter_mut().zip(line) {
                 *sum += share.weight * f32::from(*value);
             }

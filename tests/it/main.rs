@@ -11,6 +11,7 @@ mod evaluation;
 mod full_disk;
 mod metrics;
 mod modality_plugin;
+mod mp4_edit;
 mod odd_files;
 mod odd_videos;
 mod parity;
@@ -31,6 +32,7 @@ mod tiny_movie;
 mod train_mget;
 mod training;
 mod trajectories;
+mod video_matrix;
 mod vrs_writer;
 
 mod kill;

@@ -2,7 +2,7 @@
 //! right or refused with a reason, by the library and by `reviv reconstruct`.
 
 use crate::reconstruct_command::Place;
-use crate::tiny_movie::{Movie, Picture};
+use crate::tiny_movie::{Movie, Picture, container};
 use reviv::video::{DecoderChoice, Video, VideoSettings};
 use std::path::PathBuf;
 
@@ -76,6 +76,139 @@ fn turned_videos_come_out_upright() {
             }
         }
     }
+}
+
+#[test]
+fn mirrored_videos_come_out_as_they_are_shown() {
+    let folder = Folder::new();
+    let one = 1 << 16;
+    for (matrix, size, seen) in [
+        ([-one, 0, 0, one], [64, 32], [150, 220, 40, 40]),
+        ([one, 0, 0, -one], [64, 32], [40, 40, 220, 150]),
+        ([0, one, one, 0], [32, 64], [220, 40, 150, 40]),
+        ([0, -one, -one, 0], [32, 64], [40, 150, 40, 220]),
+    ] {
+        let movie = Movie {
+            matrix: Some(matrix),
+            ..Movie::new([64, 32], 30, vec![Picture::Luma(corners)])
+        };
+        let video = open(&folder.file("mirrored.mp4", &movie.bytes())).unwrap();
+        assert!(video.info().mirrored);
+        let image = video.frames(0..1).unwrap().next().unwrap().unwrap().image;
+        let [width, height] = size;
+        assert_eq!([image.width, image.height], size);
+        let at = |x: u32, y: u32| image.data[3 * (y * width + x) as usize];
+        let found = [
+            (2, 2),
+            (width - 3, 2),
+            (2, height - 3),
+            (width - 3, height - 3),
+        ]
+        .map(|(x, y)| f64::from(at(x, y)) * 219.0 / 255.0 + 16.0);
+        for (found, seen) in found.into_iter().zip(seen) {
+            assert!(
+                (found - f64::from(seen)).abs() <= 2.0,
+                "{matrix:?}: {found} {seen}"
+            );
+        }
+    }
+}
+
+/// Luma 20 + 4 k says that a picture is number k.
+fn numbers(video: &Video) -> Vec<usize> {
+    let frames = video.frames(0..video.info().frames).unwrap();
+    let luma = frames.map(|frame| f64::from(frame.unwrap().image.data[0]) * 219.0 / 255.0 + 16.0);
+    luma.map(|luma| ((luma - 20.0) / 4.0).round() as usize)
+        .collect()
+}
+
+fn numbered(count: u8) -> Vec<Picture> {
+    (0..count).map(|at| Picture::Flat(20 + 4 * at)).collect()
+}
+
+#[test]
+fn edit_lists_say_what_is_shown_and_when() {
+    let folder = Folder::new();
+    let one = 1 << 16;
+    let read = |edits: Vec<(u32, i32, i32)>| {
+        let movie = Movie {
+            edits,
+            ..Movie::new([16, 16], 10, numbered(40))
+        };
+        open(&folder.file("edited.mp4", &movie.bytes()))
+    };
+    let video = read(vec![(5, 3, one), (4, 30, one), (3, 3, one)]).unwrap();
+    assert_eq!(numbers(&video), [3, 4, 5, 6, 7, 30, 31, 32, 33, 3, 4, 5]);
+    assert_eq!((video.info().fps, video.info().seconds()), (10.0, 1.2));
+    // A gap is time without frames.
+    let video = read(vec![(7, -1, one), (5, 0, one), (10, -1, one), (5, 20, one)]).unwrap();
+    assert_eq!(numbers(&video), [0, 1, 2, 3, 4, 20, 21, 22, 23, 24]);
+    assert!((video.schedule().seconds(5) - 1.5).abs() < 1e-9);
+    assert_eq!(
+        numbers(&read(vec![(0, 35, one)]).unwrap()),
+        [35, 36, 37, 38, 39]
+    );
+    for (edits, reason) in [
+        (vec![(5, 0, 2 * one)], "changes the speed"),
+        (vec![(5, 100, one)], "hides every frame"),
+        (vec![(5, -3, one)], "starts before its media"),
+        (vec![(40, 0, one); 1000], "without end"),
+    ] {
+        let said = read(edits).unwrap_err();
+        assert!(
+            said.contains(reason) && said.contains("edited.mp4"),
+            "{said}"
+        );
+    }
+}
+
+#[test]
+fn several_descriptions_empty_samples_and_trailers_are_read() {
+    let folder = Folder::new();
+    let two = Movie {
+        second_entry: Some(11),
+        ..Movie::new([16, 16], 30, numbered(20))
+    };
+    let video = open(&folder.file("two.mp4", &two.bytes())).unwrap();
+    assert_eq!(numbers(&video), (0..20).collect::<Vec<_>>());
+
+    let mut pictures = numbered(10);
+    pictures[3] = Picture::Nothing;
+    pictures[9] = Picture::Nothing;
+    let video =
+        open(&folder.file("empty.mp4", &Movie::new([16, 16], 10, pictures).bytes())).unwrap();
+    assert_eq!(numbers(&video), [0, 1, 2, 4, 5, 6, 7, 8]);
+    assert!((video.schedule().seconds(3) - 0.4).abs() < 1e-9);
+
+    let trailer = [0x7f, 0xff, 0xff, 0xff, b'c', b'a', b'm', b'e', b'r', b'a'];
+    let bytes = [
+        Movie::new([16, 16], 10, numbered(5)).bytes(),
+        trailer.to_vec(),
+    ]
+    .concat();
+    assert_eq!(
+        numbers(&open(&folder.file("trailer.mp4", &bytes)).unwrap()).len(),
+        5
+    );
+
+    let shapes = container(*b"pasp", &[&4_u32.to_be_bytes(), &3_u32.to_be_bytes()]);
+    let wide = Movie {
+        shapes,
+        ..Movie::new([48, 16], 10, numbered(2))
+    };
+    let video = open(&folder.file("wide.mp4", &wide.bytes())).unwrap();
+    assert_eq!((video.info().width, video.info().height), (64, 16));
+    assert_eq!(
+        video
+            .frames(1..2)
+            .unwrap()
+            .next()
+            .unwrap()
+            .unwrap()
+            .image
+            .width,
+        64
+    );
 }
 
 #[test]

@@ -3,7 +3,7 @@
 use crate::shared;
 use reviv::formats::ReadError;
 use reviv::video::image::Image;
-use reviv::video::{DecoderChoice, Video, VideoSettings, embedded, ffmpeg, h264, mp4};
+use reviv::video::{DecoderChoice, Video, VideoSettings, embedded, ffmpeg, mp4};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -33,13 +33,11 @@ fn kitchen() -> Option<PathBuf> {
 
 fn planes(path: &Path, frames: Vec<usize>) -> Vec<(usize, u32)> {
     let track = mp4::read(path).unwrap();
-    let configuration =
-        h264::Configuration::parse(track.avc_configuration.as_ref().unwrap()).unwrap();
-    let (index, _) = embedded::Index::new(path, track, configuration).unwrap();
-    embedded::Wanted::new(Arc::new(index), frames)
+    let (index, _) = embedded::Index::new(path, track).unwrap().unwrap();
+    embedded::Wanted::new(Arc::new(index), &frames)
         .unwrap()
         .map(|frame| {
-            let (frame, picture) = frame.unwrap();
+            let (frame, picture, _) = frame.unwrap();
             (frame, crc32(&[&picture.y, &picture.u, &picture.v]))
         })
         .collect()
@@ -255,6 +253,38 @@ fn every_start_gives_the_frames_that_playing_from_the_beginning_gives() {
             .copied()
             .collect();
         assert_eq!(found, square.data, "clip frame {k}");
+    }
+}
+
+/// Groups of pictures are decoded side by side and come in their order, with the pixels of one thread.
+#[test]
+fn squares_do_not_depend_on_the_number_of_threads() {
+    let mut videos = vec![own("synthetic_30fps.mp4"), own("synthetic_rotated.mp4")];
+    videos.extend(kitchen());
+    for path in videos {
+        let video = Video::open(&path).unwrap();
+        let frames: Vec<usize> = (0..video.info().frames).step_by(3).collect();
+        let read = |threads: usize| -> Vec<(usize, Image)> {
+            let squares = video.squares(frames.clone(), 48, threads).unwrap();
+            squares.map(Result::unwrap).collect()
+        };
+        let one = read(1);
+        assert_eq!(
+            one.iter().map(|(frame, _)| *frame).collect::<Vec<_>>(),
+            frames
+        );
+        for threads in [2, 5] {
+            assert!(read(threads) == one, "{} on {threads}", path.display());
+        }
+        // Whoever leaves early leaves nothing behind that waits for ever.
+        assert!(
+            video
+                .squares(frames.clone(), 48, 3)
+                .unwrap()
+                .next()
+                .unwrap()
+                .is_ok()
+        );
     }
 }
 

@@ -10,6 +10,8 @@ pub enum Picture {
     Flat(u8),
     /// As the one before.
     Again,
+    /// A sample of no bytes.
+    Nothing,
 }
 
 /// A video to be written.
@@ -23,6 +25,14 @@ pub struct Movie {
     pub timescale: u32,
     /// Degrees clockwise by which a player has to turn it.
     pub rotation: u32,
+    /// `a b c d` of the track's matrix instead of a rotation.
+    pub matrix: Option<[i32; 4]>,
+    /// Segments: ticks, first tick of the media, rate as 16.16 fixed point.
+    pub edits: Vec<(u32, i32, i32)>,
+    /// More boxes of the sample description.
+    pub shapes: Vec<u8>,
+    /// From this picture on a second sample description holds, which is the first once more.
+    pub second_entry: Option<usize>,
     /// `vide`; anything else is another kind of track.
     pub handler: [u8; 4],
 }
@@ -36,6 +46,10 @@ impl Movie {
             durations: vec![1],
             timescale: fps,
             rotation: 0,
+            matrix: None,
+            edits: Vec::new(),
+            shapes: Vec::new(),
+            second_entry: None,
             handler: *b"vide",
         }
     }
@@ -63,6 +77,10 @@ impl Movie {
         let mut samples = Vec::with_capacity(self.pictures.len());
         for picture in &self.pictures {
             let unit = match picture {
+                Picture::Nothing => {
+                    samples.push(Vec::new());
+                    continue;
+                }
                 Picture::Again => {
                     frame_number += 1;
                     self.repeated(frame_number)
@@ -179,7 +197,11 @@ impl Movie {
         entry[76..78].copy_from_slice(&[0xff, 0xff]);
         let entry = container(
             *b"avc1",
-            &[&entry, &container(*b"avcC", &[&self.configuration()])],
+            &[
+                &entry,
+                &container(*b"avcC", &[&self.configuration()]),
+                &self.shapes,
+            ],
         );
         let words =
             |values: &[u32]| -> Vec<u8> { values.iter().flat_map(|v| v.to_be_bytes()).collect() };
@@ -189,20 +211,28 @@ impl Movie {
         for (at, sample) in samples.iter().enumerate() {
             times.extend([1, duration(at)]);
             sizes.push(sample.len() as u32);
-            if !matches!(self.pictures[at], Picture::Again) {
+            if !matches!(self.pictures[at], Picture::Again | Picture::Nothing) {
                 starts.push(at as u32 + 1);
                 starts[1] += 1;
             }
         }
+        // One chunk, or one for each description.
+        let (mut chunks, mut offsets) = (vec![0, 1, 1, count.max(1), 1], vec![0, 1, first]);
+        if let Some(second) = self.second_entry {
+            let before: usize = samples[..second].iter().map(Vec::len).sum();
+            let second = second as u32;
+            chunks = vec![0, 2, 1, second, 1, 2, count - second, 2];
+            offsets = vec![0, 2, first, first + before as u32];
+        }
         let table = container(
             *b"stbl",
             &[
-                &container(*b"stsd", &[&words(&[0, 1]), &entry]),
+                &container(*b"stsd", &[&words(&[0, 2]), &entry, &entry]),
                 &container(*b"stts", &[&words(&times)]),
                 &container(*b"stss", &[&words(&starts)]),
-                &container(*b"stsc", &[&words(&[0, 1, 1, count.max(1), 1])]),
+                &container(*b"stsc", &[&words(&chunks)]),
                 &container(*b"stsz", &[&words(&sizes)]),
-                &container(*b"stco", &[&words(&[0, 1, first])]),
+                &container(*b"stco", &[&words(&offsets)]),
             ],
         );
         let location = container(
@@ -235,6 +265,11 @@ impl Movie {
             270 => [0, -one, 0, one, 0, 0, 0, 0, 0x4000_0000],
             _ => [one, 0, 0, 0, one, 0, 0, 0, 0x4000_0000],
         };
+        let movie_matrix = words(&[one, 0, 0, 0, one, 0, 0, 0, 0x4000_0000].map(|v: i32| v as u32));
+        let matrix = match self.matrix {
+            Some([a, b, c, d]) => [a, b, 0, c, d, 0, 0, 0, 0x4000_0000],
+            None => matrix,
+        };
         let matrix = words(&matrix.map(|value: i32| value as u32));
         let track = container(
             *b"tkhd",
@@ -258,16 +293,29 @@ impl Movie {
                     0,
                     0,
                 ]),
-                &matrix,
+                &movie_matrix,
                 &words(&[0, 0, 0, 0, 0, 0, 2]),
             ],
         );
-        container(*b"moov", &[&movie, &container(*b"trak", &[&track, &media])])
+        let mut list = vec![0, self.edits.len() as u32];
+        for &(duration, time, rate) in &self.edits {
+            list.extend([duration, time as u32, rate as u32]);
+        }
+        let edits = container(*b"edts", &[&container(*b"elst", &[&words(&list)])]);
+        let edits = if self.edits.is_empty() {
+            Vec::new()
+        } else {
+            edits
+        };
+        container(
+            *b"moov",
+            &[&movie, &container(*b"trak", &[&track, &edits, &media])],
+        )
     }
 }
 
 /// A box.
-fn container(kind: [u8; 4], parts: &[&[u8]]) -> Vec<u8> {
+pub fn container(kind: [u8; 4], parts: &[&[u8]]) -> Vec<u8> {
     let size = 8 + parts.iter().map(|part| part.len()).sum::<usize>();
     let mut bytes = (size as u32).to_be_bytes().to_vec();
     bytes.extend(kind);

@@ -44,7 +44,7 @@ enum Frames {
 pub(super) struct Stream<'a> {
     /// Frames of the video, by window.
     chosen: Vec<Vec<usize>>,
-    decoded: Option<video::Frames>,
+    decoded: Option<video::Squares>,
     held: BTreeMap<usize, Image>,
     clip: Option<&'a Rgb>,
     format: &'a ClipFormat,
@@ -102,7 +102,7 @@ impl Recording {
                     info.height,
                     info.frames,
                     info.seconds(),
-                    info.decoder
+                    info.read_by()
                 ),
             ),
             fact(
@@ -126,10 +126,20 @@ impl Recording {
                 ),
             ),
         ];
-        if info.rotation != 0 {
+        if info.rotation != 0 || info.mirrored {
+            let mirrored = if info.mirrored { "mirrored, then " } else { "" };
             assumptions.push(fact(
                 "Rotation",
-                format_args!("{} degrees, from the file", info.rotation),
+                format_args!("{mirrored}{} degrees, from the file", info.rotation),
+            ));
+        }
+        if (info.pixel_aspect - 1.0).abs() > 1e-6 {
+            assumptions.push(fact(
+                "Pixels",
+                format_args!(
+                    "{:.4} times as wide as high by the file, made square",
+                    info.pixel_aspect
+                ),
             ));
         }
         assumptions.extend(said(&settings.lens, &intrinsics));
@@ -235,8 +245,9 @@ impl Recording {
                     schedule.clip(first, format.video_rate, format.frames)
                 };
                 let chosen: Vec<Vec<usize>> = windows.iter().map(of).collect();
+                let threads = rayon::current_num_threads();
                 let decoded = video
-                    .chosen(chosen.concat())
+                    .squares(chosen.concat(), format.size as u32, threads)
                     .map_err(|error| unreadable(&error))?;
                 (chosen, Some(decoded), None)
             }
@@ -322,7 +333,7 @@ impl Stream<'_> {
         for (mut slot, wanted) in frames.outer_iter_mut().zip(chosen) {
             while !self.held.contains_key(wanted) {
                 let frame = self.decoded.as_mut().and_then(Iterator::next);
-                let frame = frame
+                let (number, square) = frame
                     .ok_or_else(|| {
                         input(
                             format_args!("the video ends before its frame {wanted}"),
@@ -330,8 +341,7 @@ impl Stream<'_> {
                         )
                     })?
                     .map_err(|error| unreadable(&error))?;
-                self.held
-                    .insert(frame.index, frame.image.square(side as u32));
+                self.held.insert(number, square);
             }
             slot.assign(&video::to_array(&self.held[wanted]));
         }

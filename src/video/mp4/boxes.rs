@@ -1,9 +1,10 @@
 //! Boxes inside boxes: the movie header down to the track and its codec.
 
-use super::fragment::Defaults;
-use super::{DEEPEST, Track};
+use super::fragment::{Defaults, entry_index};
+use super::{DEEPEST, Edit, Track};
 use crate::formats::ReadError;
 use crate::formats::read_error::Position;
+use crate::video::image::Orientation;
 use std::path::Path;
 
 pub(super) struct Boxes<'a> {
@@ -76,27 +77,42 @@ impl Boxes<'_> {
 
     pub(super) fn movie(&self, moov: &[u8]) -> Result<(Track, Defaults), ReadError> {
         let top = self.children(moov, 0, 0)?;
-        let mut video = None;
-        for trak in top.iter().filter(|inner| &inner.kind == b"trak") {
-            if let Some(found) = self.track(*trak)? {
-                video = Some(found);
-                break;
-            }
+        let mut movie = Movie::default();
+        if let Some(mvhd) = top.iter().find(|inner| &inner.kind == b"mvhd") {
+            let wide = mvhd.data.first() == Some(&1);
+            movie.timescale = be32(mvhd.data, if wide { 20 } else { 12 }).unwrap_or(0);
+            movie.matrix = Matrix::read(mvhd.data, if wide { 48 } else { 36 });
         }
-        let Some((track, track_id)) = video else {
+        let chapters = movie_chapters(&top);
+        let mut tracks = Vec::new();
+        for trak in top.iter().filter(|inner| &inner.kind == b"trak") {
+            tracks.extend(self.track(*trak, &movie, &chapters)?);
+        }
+        // A picture of its own is a cover where there is a video beside it.
+        let still = |track: &Track| matches!(&track.entries[0].codec, b"jpeg" | b"png " | b"mjpa");
+        if tracks.iter().any(|track| !still(track)) {
+            tracks.retain(|track| !still(track));
+        }
+        let chosen = tracks.iter().position(|track| track.enabled).unwrap_or(0);
+        if top.iter().any(|inner| &inner.kind == b"cmov") {
+            return Err(ReadError::unsupported(
+                self.path,
+                "a compressed movie header",
+            ));
+        }
+        if tracks.is_empty() {
             return Err(ReadError::malformed(
                 self.path,
                 Position::Offset(self.base),
                 "there is no video track",
             ));
-        };
-        let mut defaults = Defaults {
-            track_id,
-            ..Defaults::default()
-        };
+        }
+        let track = tracks.swap_remove(chosen);
+        let mut defaults = Defaults::default();
         for mvex in top.iter().filter(|inner| &inner.kind == b"mvex") {
             for trex in self.children(mvex.data, mvex.at, 1)? {
-                if &trex.kind == b"trex" && be32(trex.data, 4) == Some(track_id) {
+                if &trex.kind == b"trex" && be32(trex.data, 4) == Some(track.id) {
+                    defaults.entry = entry_index(self.need(be32(trex.data, 8), trex.at, "trex")?);
                     defaults.duration = self.need(be32(trex.data, 12), trex.at, "trex")?;
                     defaults.size = self.need(be32(trex.data, 16), trex.at, "trex")?;
                     defaults.flags = self.need(be32(trex.data, 20), trex.at, "trex")?;
@@ -106,16 +122,21 @@ impl Boxes<'_> {
         Ok((track, defaults))
     }
 
-    /// The track and its id, if it is a video track.
-    pub(super) fn track(&self, trak: Inner<'_>) -> Result<Option<(Track, u32)>, ReadError> {
+    /// The track, if it is a video track.
+    fn track(
+        &self,
+        trak: Inner<'_>,
+        movie: &Movie,
+        chapters: &[u32],
+    ) -> Result<Option<Track>, ReadError> {
         let mut header = None;
         let mut media = None;
-        let mut edit_start = 0;
+        let mut edits = Vec::new();
         for inner in self.children(trak.data, trak.at, 1)? {
             match &inner.kind {
                 b"tkhd" => header = Some(inner),
                 b"mdia" => media = Some(inner),
-                b"edts" => edit_start = self.edit_start(inner)?,
+                b"edts" => edits = self.edits(inner)?,
                 _ => {}
             }
         }
@@ -150,80 +171,136 @@ impl Boxes<'_> {
             return Err(self.damaged(media.at, "the video track's timescale is 0"));
         }
         let wide = header.data.first() == Some(&1);
-        let track_id = self.need(
-            be32(header.data, if wide { 20 } else { 12 }),
-            header.at,
-            "tkhd",
-        )?;
-        let matrix = if wide { 52 } else { 40 };
-        let a = self.need(be32(header.data, matrix), header.at, "tkhd")? as i32;
-        let b = self.need(be32(header.data, matrix + 4), header.at, "tkhd")? as i32;
-        let turn = f64::from(b).atan2(f64::from(a)).to_degrees();
-        let rotation = ((turn / 90.0).round() as i32).rem_euclid(4) as u32 * 90;
-
+        let need = |at: usize| self.need(be32(header.data, at), header.at, "tkhd");
+        let flags = need(0)?;
+        let id = need(if wide { 20 } else { 12 })?;
+        if chapters.contains(&id) {
+            return Ok(None);
+        }
+        let at = if wide { 52 } else { 40 };
+        need(at + 32)?;
+        let matrix = Matrix::read(header.data, at).after(movie.matrix);
+        let side = |at: usize| be32(header.data, at).unwrap_or(0) >> 16;
         let mut track = Track {
-            codec: *b"    ",
-            avc_configuration: None,
-            rotation,
+            id,
+            enabled: flags & 1 != 0,
+            entries: Vec::new(),
+            orientation: Orientation::from_matrix(matrix.0),
+            stretch: matrix.stretch(),
+            size: [side(at + 36), side(at + 40)],
             timescale,
+            movie_timescale: movie.timescale,
             samples: Vec::new(),
-            first_shown: edit_start,
+            edits,
+            fragmented: false,
         };
         self.sample_table(table, &mut track)?;
-        Ok(Some((track, track_id)))
+        if track.entries.is_empty() {
+            return Err(self.damaged(table.at, "no sample description (`stsd`)"));
+        }
+        Ok(Some(track))
     }
 
-    /// Media time of the first edit that shows something.
-    pub(super) fn edit_start(&self, edts: Inner<'_>) -> Result<i64, ReadError> {
+    fn edits(&self, edts: Inner<'_>) -> Result<Vec<Edit>, ReadError> {
+        let mut edits = Vec::new();
         for elst in self.children(edts.data, edts.at, 2)? {
             if &elst.kind != b"elst" {
                 continue;
             }
             let wide = elst.data.first() == Some(&1);
             let count = self.need(be32(elst.data, 4), elst.at, "elst")? as usize;
-            let entry = if wide { 20 } else { 12 };
-            for index in 0..count.min(elst.data.len() / entry) {
-                let at = 8 + index * entry;
-                let media_time = if wide {
-                    be64(elst.data, at + 8).map(|value| value as i64)
+            let size = if wide { 20 } else { 12 };
+            for entry in elst.data[8..].chunks_exact(size).take(count) {
+                let fields = if wide {
+                    (be64(entry, 0), be64(entry, 8).map(|time| time as i64))
                 } else {
-                    be32(elst.data, at + 4).map(|value| i64::from(value as i32))
+                    let time = be32(entry, 4).map(|time| i64::from(time as i32));
+                    (be32(entry, 0).map(u64::from), time)
                 };
-                match media_time {
-                    Some(-1) => {}
-                    Some(time) => return Ok(time.clamp(0, i64::MAX / 4)),
-                    None => return Err(self.damaged(elst.at, "`elst` is cut off")),
+                if let (Some(duration), Some(media_time)) = fields {
+                    edits.push(Edit {
+                        duration,
+                        media_time: media_time.clamp(i64::MIN / 4, i64::MAX / 4),
+                        rate: be32(entry, size - 4).unwrap_or(0) as i32,
+                    });
                 }
             }
         }
-        Ok(0)
+        Ok(edits)
+    }
+}
+
+/// What the header of the movie says about all its tracks.
+#[derive(Debug, Default)]
+struct Movie {
+    timescale: u32,
+    matrix: Matrix,
+}
+
+/// Tracks that hold the pictures of another track's chapters.
+fn movie_chapters(top: &[Inner<'_>]) -> Vec<u32> {
+    let mut found = Vec::new();
+    for trak in top.iter().filter(|inner| &inner.kind == b"trak") {
+        for tref in plain_children(trak.data).filter(|(kind, _)| kind == b"tref") {
+            for (_, ids) in plain_children(tref.1).filter(|(kind, _)| kind == b"chap") {
+                found.extend((0..ids.len() / 4).filter_map(|at| be32(ids, 4 * at)));
+            }
+        }
+    }
+    found
+}
+
+/// Boxes with short headers, as far as they go.
+fn plain_children(data: &[u8]) -> impl Iterator<Item = ([u8; 4], &[u8])> {
+    let mut here = 0;
+    std::iter::from_fn(move || {
+        let size = be32(data, here)? as usize;
+        let kind = data.get(here + 4..here + 8)?.try_into().ok()?;
+        let body = data.get(here + 8..here.checked_add(size)?)?;
+        here += size;
+        Some((kind, body))
+    })
+}
+
+/// `a b c d` of a display matrix, 16.16 fixed point: x' = a x + c y, y' = b x + d y.
+#[derive(Debug, Clone, Copy)]
+struct Matrix([i32; 4]);
+
+impl Default for Matrix {
+    fn default() -> Self {
+        Matrix([1 << 16, 0, 0, 1 << 16])
+    }
+}
+
+impl Matrix {
+    /// Rows of three numbers each; the identity where it is cut off.
+    fn read(data: &[u8], at: usize) -> Self {
+        let cell = |index: usize| be32(data, at + 4 * index).map(|value| value as i32);
+        match [cell(0), cell(1), cell(3), cell(4)] {
+            [Some(a), Some(b), Some(c), Some(d)] => Matrix([a, b, c, d]),
+            _ => Self::default(),
+        }
     }
 
-    pub(super) fn description(&self, stsd: Inner<'_>, track: &mut Track) -> Result<(), ReadError> {
-        let entries = self.children(stsd.data.get(8..).unwrap_or(&[]), stsd.at + 8, 5)?;
-        let Some(entry) = entries.first() else {
-            return Err(self.damaged(stsd.at, "`stsd` describes nothing"));
-        };
-        track.codec = entry.kind;
-        // Extensions start at 78.
-        if let Some(rest) = entry.data.get(78..) {
-            // Trailing bytes that are no box do occur here: look for `avcC` only as far as boxes go.
-            let mut here = 0;
-            while let (Some(size), Some(kind)) = (be32(rest, here), rest.get(here + 4..here + 8)) {
-                let size = size as usize;
-                let Some(body) = rest.get(here + 8..(here + size).max(here + 8)) else {
-                    break;
-                };
-                if kind == b"avcC" {
-                    track.avc_configuration = Some(body.to_vec());
-                }
-                if size < 8 {
-                    break;
-                }
-                here += size;
-            }
-        }
-        Ok(())
+    /// First this one, then `next`.
+    fn after(self, next: Self) -> Self {
+        let [a, b, c, d] = self.0.map(i64::from);
+        let [e, f, g, h] = next.0.map(i64::from);
+        let cell = |p: i64, q: i64| ((p + q) >> 16).clamp(i32::MIN.into(), i32::MAX.into()) as i32;
+        Matrix([
+            cell(a * e, b * g),
+            cell(a * f, b * h),
+            cell(c * e, d * g),
+            cell(c * f, d * h),
+        ])
+    }
+
+    /// Width to height of a pixel where the two differ by more than a hundredth.
+    fn stretch(self) -> Option<f64> {
+        let [a, b, c, d] = self.0.map(f64::from);
+        let (x, y) = (a.hypot(c), b.hypot(d));
+        let ratio = x / y;
+        (x > 1.0 && y > 1.0 && (ratio - 1.0).abs() > 0.01).then_some(ratio)
     }
 }
 

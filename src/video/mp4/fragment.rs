@@ -1,18 +1,24 @@
 //! Movie fragments: samples that are described beside the media, a few seconds at a time.
 
 use super::boxes::{Boxes, be32, be64};
-use super::{SMALLEST_MEAN_SAMPLE, Sample, Track};
+use super::{SMALLEST_SAMPLE, Sample, Track};
 use crate::formats::ReadError;
 
 /// What fragments leave out.
 #[derive(Debug, Default, Clone)]
 pub(super) struct Defaults {
-    pub(super) track_id: u32,
+    /// Index of the sample description.
+    pub(super) entry: u16,
     pub(super) duration: u32,
     pub(super) size: u32,
     pub(super) flags: u32,
     /// Decoding time after the last fragment.
     pub(super) next_time: i64,
+}
+
+/// From a number that counts from 1.
+pub(super) fn entry_index(number: u32) -> u16 {
+    u16::try_from(number.saturating_sub(1)).unwrap_or(u16::MAX)
 }
 
 impl Boxes<'_> {
@@ -31,7 +37,7 @@ impl Boxes<'_> {
             let Some(header) = inside.iter().find(|inner| &inner.kind == b"tfhd") else {
                 continue;
             };
-            if be32(header.data, 4) != Some(defaults.track_id) {
+            if be32(header.data, 4) != Some(track.id) {
                 continue;
             }
             let flags = self.need(be32(header.data, 0), header.at, "tfhd")? & 0x00ff_ffff;
@@ -42,7 +48,9 @@ impl Boxes<'_> {
                     .ok_or_else(|| self.damaged(header.at, "`tfhd` is cut off"))?;
                 at += 8;
             }
+            let mut entry = defaults.entry;
             if flags & 2 != 0 {
+                entry = entry_index(self.need(be32(header.data, at), header.at, "tfhd")?);
                 at += 4;
             }
             let mut field = |bit: u32, default: u32| {
@@ -82,7 +90,7 @@ impl Boxes<'_> {
                     first_flags = Some(self.need(be32(trun.data, at), trun.at, "trun")?);
                     at += 4;
                 }
-                let most = (self.file_len / SMALLEST_MEAN_SAMPLE) as usize;
+                let most = (self.file_len / SMALLEST_SAMPLE) as usize;
                 if track.samples.len().saturating_add(count) > most {
                     return Err(self.damaged(
                         trun.at,
@@ -115,6 +123,7 @@ impl Boxes<'_> {
                     track.samples.push(Sample {
                         offset,
                         size,
+                        entry,
                         time: defaults.next_time + shift,
                         // bit 16: not a sync sample
                         sync: sample_flags & 0x1_0000 == 0,

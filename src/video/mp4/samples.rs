@@ -1,7 +1,8 @@
 //! The sample tables of a track: where each picture's bytes are, and when it is shown.
 
 use super::boxes::{Boxes, Inner, be32, be64};
-use super::{SMALLEST_MEAN_SAMPLE, Sample, Track};
+use super::fragment::entry_index;
+use super::{SMALLEST_SAMPLE, Sample, Track};
 use crate::formats::ReadError;
 
 #[derive(Default)]
@@ -11,6 +12,8 @@ struct Tables<'b> {
     syncs: Option<&'b [u8]>,
     chunks: &'b [u8],
     sizes: &'b [u8],
+    /// Bits of a size in `stz2`; 0 where sizes are those of `stsz`.
+    size_bits: usize,
     offsets: Option<(&'b [u8], usize)>,
 }
 
@@ -52,12 +55,16 @@ impl Boxes<'_> {
         let mut tables = Tables::default();
         for inner in self.children(stbl.data, stbl.at, 4)? {
             match &inner.kind {
-                b"stsd" => self.description(inner, track)?,
+                b"stsd" => self.descriptions(inner, track)?,
                 b"stts" => tables.durations = inner.data,
                 b"ctts" => tables.shifts = inner.data,
                 b"stss" => tables.syncs = Some(inner.data),
                 b"stsc" => tables.chunks = inner.data,
                 b"stsz" => tables.sizes = inner.data,
+                b"stz2" => {
+                    tables.sizes = inner.data;
+                    tables.size_bits = usize::from(inner.data.get(7).copied().unwrap_or(0));
+                }
                 b"stco" => tables.offsets = Some((inner.data, 4)),
                 b"co64" => tables.offsets = Some((inner.data, 8)),
                 _ => {}
@@ -71,7 +78,12 @@ impl Boxes<'_> {
         if count == 0 {
             return Ok(()); // a fragmented file
         }
-        if count > self.file_len / SMALLEST_MEAN_SAMPLE {
+        let smallest = if tables.size_bits == 0 {
+            SMALLEST_SAMPLE
+        } else {
+            1
+        };
+        if count > self.file_len / smallest {
             return Err(self.damaged(
                 at,
                 format!(
@@ -80,7 +92,28 @@ impl Boxes<'_> {
                 ),
             ));
         }
-        let constant = be32(tables.sizes, 4).unwrap_or(0);
+        let constant = if tables.size_bits == 0 {
+            be32(tables.sizes, 4).unwrap_or(0)
+        } else {
+            0
+        };
+        let size_of = |index: usize| match tables.size_bits {
+            0 => be32(tables.sizes, 12 + 4 * index),
+            4 => {
+                let pair = tables.sizes.get(12 + index / 2)?;
+                Some(u32::from(if index % 2 == 0 {
+                    pair >> 4
+                } else {
+                    pair & 15
+                }))
+            }
+            8 => tables.sizes.get(12 + index).copied().map(u32::from),
+            16 => {
+                let pair = tables.sizes.get(12 + 2 * index..14 + 2 * index)?;
+                Some(u32::from(u16::from_be_bytes([pair[0], pair[1]])))
+            }
+            _ => None,
+        };
         let Some((offsets, width)) = tables.offsets else {
             return Err(self.damaged(at, "no chunk offsets (`stco` or `co64`)"));
         };
@@ -102,6 +135,7 @@ impl Boxes<'_> {
         let (mut chunk, mut chunk_run, mut left_in_chunk, mut offset) =
             (0_u64, 0_usize, 0_u32, 0_u64);
         let mut decode_time = 0_i64;
+        let mut entry = 0;
         for index in 0..count {
             if left_in_chunk == 0 {
                 if index > 0 {
@@ -119,6 +153,7 @@ impl Boxes<'_> {
                         self.damaged(at, format!("chunk {chunk} holds no samples (`stsc`)"))
                     );
                 }
+                entry = entry_index(be32(tables.chunks, 16 + 12 * chunk_run).unwrap_or(1));
                 offset = chunk_offset(chunk).ok_or_else(|| {
                     self.damaged(at, format!("no offset for chunk {chunk}, sample {index}"))
                 })?;
@@ -126,7 +161,7 @@ impl Boxes<'_> {
             let size = if constant != 0 {
                 constant
             } else {
-                be32(tables.sizes, 12 + 4 * index as usize).ok_or_else(|| {
+                size_of(index as usize).ok_or_else(|| {
                     self.damaged(at, format!("no size for sample {index} (`stsz`)"))
                 })?
             };
@@ -145,6 +180,7 @@ impl Boxes<'_> {
             samples.push(Sample {
                 offset,
                 size,
+                entry,
                 time: decode_time + i64::from(shift),
                 sync,
             });
