@@ -18,6 +18,7 @@ use crate::experiment::load;
 use crate::experiment::registry::Registry;
 use crate::formats::text::of_path;
 use crate::ops::clips::SourceSettings;
+use crate::video::DecoderChoice;
 use serde::Deserialize as _;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
@@ -73,6 +74,9 @@ struct Cut {
     /// Take a recording shorter than a clip as one clip: the last frame is repeated, signals after the end are invalid
     #[arg(long)]
     pad_short: bool,
+    /// Who decodes videos
+    #[arg(long, value_enum, default_value_t, value_name = "DECODER")]
+    decoder: DecoderChoice,
 }
 
 fn kind(text: &str) -> Result<Dataset, String> {
@@ -88,6 +92,7 @@ impl Cut {
             undistort: self.undistort,
             pad_short: self.pad_short,
             stride: self.stride,
+            decoder: self.decoder,
             ..CutSettings::default()
         }
     }

@@ -10,6 +10,7 @@ use crate::reconstruction::predictions::ScaleStatus;
 use crate::run::execute::{Job, Outcome, cache_of, execute};
 use crate::run::schedule::Schedule;
 use crate::run::{Interrupt, RunDirectory, RunError, Shard, State, WorkerPool, files, metrics};
+use crate::video::DecoderChoice;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
@@ -50,6 +51,9 @@ pub struct Reconstruct {
     /// At most so many seconds of the video
     #[arg(long, value_name = "SECONDS")]
     seconds: Option<f64>,
+    /// Who decodes the video
+    #[arg(long, value_enum, value_name = "DECODER")]
+    decoder: Option<DecoderChoice>,
     /// The seed of the decoding
     #[arg(long, value_name = "N")]
     seed: Option<u64>,
@@ -141,6 +145,9 @@ impl Reconstruct {
         }
         if let Some(seconds) = self.seconds {
             set.push(change("seconds", &seconds.to_string()));
+        }
+        if let Some(decoder) = self.decoder {
+            set.push(change("reading.decoder", decoder.name()));
         }
         set.extend(self.set.iter().cloned());
         Ok(Request {

@@ -50,6 +50,11 @@ pub trait ClipSource: Send + Sync {
         Vec::new()
     }
 
+    /// Which decoders read its videos, each with the number of recordings.
+    fn decoders(&self) -> Vec<(String, usize)> {
+        Vec::new()
+    }
+
     /// Signals that the recording of clip number `index` has and the clip goes without, each with the reason: `body: ...`.
     fn lost(&self, index: usize) -> Vec<String> {
         let _ = index;

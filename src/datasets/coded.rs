@@ -52,6 +52,10 @@ impl ClipSource for Coded {
         self.source.notes()
     }
 
+    fn decoders(&self) -> Vec<(String, usize)> {
+        self.source.decoders()
+    }
+
     fn lost(&self, index: usize) -> Vec<String> {
         self.source.lost(index)
     }

@@ -3,6 +3,7 @@
 use super::ReadError;
 use crate::clip::clock::CLIP_SECONDS;
 use crate::modality::ClipFormat;
+use crate::video::DecoderChoice;
 
 /// How clips are cut from recordings.
 #[derive(Debug, Clone, PartialEq, serde::Serialize, serde::Deserialize, schemars::JsonSchema)]
@@ -23,6 +24,8 @@ pub struct CutSettings {
     pub pad_short: bool,
     /// Seconds from the start of one clip to the start of the next.
     pub stride: f64,
+    /// Who decodes videos.
+    pub decoder: DecoderChoice,
 }
 
 impl Default for CutSettings {
@@ -35,6 +38,7 @@ impl Default for CutSettings {
             gaze_vergence: false,
             pad_short: false,
             stride: CLIP_SECONDS,
+            decoder: DecoderChoice::Auto,
         }
     }
 }

@@ -22,6 +22,7 @@ struct Counted {
     clips: usize,
     modalities: Vec<String>,
     notes: Vec<String>,
+    decoder: Option<String>,
 }
 
 /// Recordings of one data set.
@@ -33,6 +34,8 @@ pub struct Recordings {
     excluded: Vec<Excluded>,
     /// What recordings lack, with the number of those that lack it.
     notes: BTreeMap<String, usize>,
+    /// What reads their videos.
+    decoders: BTreeMap<String, usize>,
     /// Official splits, by recording.
     splits: BTreeMap<String, &'static str>,
     /// First clip of every recording, and the number of all clips at the end.
@@ -78,6 +81,7 @@ impl Recordings {
                 Ok(Counted {
                     clips: recording.clips(&settings),
                     modalities: recording.modalities(),
+                    decoder: recording.colour.as_ref().and_then(|c| c.decoder()),
                     name: recording.id,
                     notes: recording.notes,
                 })
@@ -86,6 +90,7 @@ impl Recordings {
         let mut starts = vec![0];
         let (mut modalities, mut names): (Vec<String>, Vec<String>) = Default::default();
         let (mut opened, mut excluded, mut notes) = (Vec::new(), Vec::new(), BTreeMap::new());
+        let mut decoders = BTreeMap::new();
         let mut first_error = None;
         for (folder, counted) in folders.into_iter().zip(counted) {
             let counted = match counted {
@@ -110,6 +115,9 @@ impl Recordings {
             for note in counted.notes {
                 *notes.entry(note).or_default() += 1;
             }
+            if let Some(decoder) = counted.decoder {
+                *decoders.entry(decoder).or_default() += 1;
+            }
             for modality in counted.modalities {
                 if !modalities.contains(&modality) {
                     modalities.push(modality);
@@ -127,6 +135,7 @@ impl Recordings {
             folders: opened,
             excluded,
             notes,
+            decoders,
             splits: BTreeMap::new(),
             starts,
             names,
@@ -241,6 +250,13 @@ impl ClipSource for Recordings {
     fn notes(&self) -> Vec<(String, usize)> {
         let notes = self.notes.iter();
         notes.map(|(note, count)| (note.clone(), *count)).collect()
+    }
+
+    fn decoders(&self) -> Vec<(String, usize)> {
+        let decoders = self.decoders.iter();
+        decoders
+            .map(|(name, count)| (name.clone(), *count))
+            .collect()
     }
 
     fn lost(&self, index: usize) -> Vec<String> {

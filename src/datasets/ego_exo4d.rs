@@ -18,8 +18,8 @@ use super::open::Frames;
 use super::recording::{ColourFrames, CutSettings, MountedCamera, Recording, upright};
 use crate::formats::read_error::Position;
 use crate::geometry::camera::Camera;
-use crate::video::Video;
 use crate::video::image::{Image, Turn};
+use crate::video::{DecoderChoice, Video, VideoSettings};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use takes::Take;
@@ -55,11 +55,11 @@ pub fn source(root: &Path, settings: CutSettings) -> Result<Recordings, ReadErro
     let absent = count - takes.len();
     let folders = takes.keys().cloned().collect();
     let captures = root.join("captures");
-    let recordings = Recordings::new("ego_exo4d", folders, settings, move |folder, _| {
+    let recordings = Recordings::new("ego_exo4d", folders, settings, move |folder, settings| {
         let take = takes
             .get(folder)
             .ok_or_else(|| ReadError::missing(folder, "the take is not in `takes.json`"))?;
-        open(folder, take, &captures)
+        open(folder, take, &captures, settings.decoder)
     })?;
     Ok(if absent > 0 {
         recordings.with_note("takes of `takes.json` that are not on disk", absent)
@@ -69,7 +69,12 @@ pub fn source(root: &Path, settings: CutSettings) -> Result<Recordings, ReadErro
 }
 
 /// Opens one take.
-fn open(folder: &Path, take: &Take, captures: &Path) -> Result<Recording, ReadError> {
+fn open(
+    folder: &Path,
+    take: &Take,
+    captures: &Path,
+    decoder: DecoderChoice,
+) -> Result<Recording, ReadError> {
     let mut recording = Recording::new("ego_exo4d", take.name());
     if take.is_dropped() {
         return Err(ReadError::missing(
@@ -100,7 +105,7 @@ fn open(folder: &Path, take: &Take, captures: &Path) -> Result<Recording, ReadEr
             "there is no `captures/<capture>/timesync.csv`, which says when frames were captured",
         )),
         (Some(path), Some(rows)) => {
-            let video = Video::open(path)?;
+            let video = Video::open_with(path, &VideoSettings::by(decoder))?;
             side = video.info().width;
             if side != video.info().height {
                 let reason = format!("{side} x {} pixels, not a square", video.info().height);

@@ -12,7 +12,7 @@ use super::recording::{CutSettings, DepthFrames, MountedCamera, Recording};
 use super::track::{SECOND, Track};
 use crate::formats::npz::Npz;
 use crate::formats::read_error::Position;
-use crate::video::Video;
+use crate::video::{DecoderChoice, Video, VideoSettings};
 use nalgebra::{Isometry3, UnitQuaternion, Vector3};
 use ndarray::{Array2, Array3, Axis, Ix3};
 use std::collections::BTreeSet;
@@ -88,13 +88,13 @@ pub fn source(root: &Path, settings: CutSettings) -> Result<Recordings, ReadErro
         ));
     }
     let paths = names.into_iter().map(|name| root.join(name)).collect();
-    Recordings::new("egogen", paths, settings, move |path, _| {
+    Recordings::new("egogen", paths, settings, move |path, settings| {
         let name = path.file_name().unwrap_or_default().to_string_lossy();
-        open(&folders, &name)
+        open(&folders, &name, settings.decoder)
     })
 }
 
-fn open(folders: &Folders, name: &str) -> Result<Recording, ReadError> {
+fn open(folders: &Folders, name: &str, decoder: DecoderChoice) -> Result<Recording, ReadError> {
     let mut recording = Recording::new("egogen", name);
     let missing = |folder: &str, extension: &str, what: &str| {
         format!("there is no `{folder}/<name>.{extension}`: no {what}")
@@ -103,7 +103,7 @@ fn open(folders: &Folders, name: &str) -> Result<Recording, ReadError> {
     recording.up_world = Some(Vector3::z_axis());
     match Folders::file(folders.rgb.as_ref(), name, &["mp4"]) {
         Some(path) => {
-            let video = Video::open(path)?;
+            let video = Video::open_with(path, &VideoSettings::by(decoder))?;
             let times = (0..video.info().frames)
                 .map(|frame| {
                     tick((video.schedule().seconds(frame) * RATE).round_ties_even() as usize)

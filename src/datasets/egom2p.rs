@@ -15,7 +15,7 @@ use crate::formats::npz::Npz;
 use crate::formats::read_error::Position;
 use crate::geometry::rigid::{self, PoseError, Rigid};
 use crate::modality::ClipFormat;
-use crate::video::Video;
+use crate::video::{Video, VideoSettings};
 use nalgebra::Point3;
 use ndarray::{Array3, ArrayView2, Axis};
 use std::collections::{BTreeMap, BTreeSet};
@@ -176,7 +176,7 @@ impl Arrays {
         let mut recording = Recording::new(&self.dataset, name);
         recording.span = Some((0, 2 * SECOND));
         if let Some(path) = files.get("rgb") {
-            let video = Video::open(path)?;
+            let video = Video::open_with(path, &VideoSettings::by(self.settings.decoder))?;
             let times = (0..video.info().frames)
                 .map(|frame| (video.schedule().seconds(frame) * SECOND as f64).round() as i64)
                 .collect();
@@ -271,7 +271,7 @@ impl ClipSource for Arrays {
 
 /// A 512-pathway depth video: grey from 0 to 255 for 0 to 15 m; 0 means nothing was measured.
 fn metric_depth(path: &Path, settings: &CutSettings) -> Result<Depth, ReadError> {
-    let video = Video::open(path)?;
+    let video = Video::open_with(path, &VideoSettings::by(settings.decoder))?;
     let frames = (settings.fps * 2.0).round() as usize;
     // Written at 8 frames a second whatever its real rate: what counts is that the frames span two seconds.
     let native = video.info().frames as f64 / 2.0;

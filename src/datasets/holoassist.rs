@@ -17,8 +17,8 @@ use super::recording::{
 };
 use super::track::{SECOND, Track, nearest};
 use crate::geometry::camera::{Camera, Lens, Pinhole};
-use crate::video::Video;
 use crate::video::image::Image;
+use crate::video::{DecoderChoice, Video, VideoSettings};
 use nalgebra::{Isometry3, Point3, Vector3};
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -45,8 +45,10 @@ pub fn source(root: &Path, settings: CutSettings) -> Result<Recordings, ReadErro
         is_session,
     )?;
     let (splits, absent) = official(root, &folders)?;
-    let recordings = Recordings::new("holoassist", folders, settings, |folder, _| open(folder))?
-        .with_splits(splits);
+    let recordings = Recordings::new("holoassist", folders, settings, |folder, settings| {
+        open_with(folder, settings.decoder)
+    })?
+    .with_splits(splits);
     Ok(if absent > 0 {
         recordings.with_note("sessions of `data_split/` that are not on disk", absent)
     } else {
@@ -93,6 +95,10 @@ pub fn is_session(folder: &Path) -> bool {
 /// # Errors
 /// When it has no clock, or a file is damaged.
 pub fn open(folder: &Path) -> Result<Recording, ReadError> {
+    open_with(folder, DecoderChoice::Auto)
+}
+
+fn open_with(folder: &Path, decoder: DecoderChoice) -> Result<Recording, ReadError> {
     let name = folder.file_name().map_or_else(
         || "session".into(),
         |name| name.to_string_lossy().into_owned(),
@@ -114,7 +120,7 @@ pub fn open(folder: &Path) -> Result<Recording, ReadError> {
 
     let mut size = None;
     if let Some(path) = video_of(&export) {
-        let video = Video::open(&path)?;
+        let video = Video::open_with(&path, &VideoSettings::by(decoder))?;
         size = Some((video.info().width, video.info().height));
         match start_of(&export)? {
             Some(start) => recording.colour = rows_as_frames(video, start, &poses).map(boxed),
@@ -311,5 +317,9 @@ impl ColourFrames for RowFrames {
             }
         }
         Ok(())
+    }
+
+    fn decoder(&self) -> Option<String> {
+        Some(self.video.info().read_by())
     }
 }

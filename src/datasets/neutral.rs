@@ -23,7 +23,7 @@ use crate::formats::is_plain_name;
 use crate::formats::read_error::Position;
 use crate::formats::text;
 use crate::video::image::Turn;
-use crate::video::{Video, VideoSettings};
+use crate::video::{DecoderChoice, Video, VideoSettings};
 use nalgebra::{Isometry3, Unit, Vector3};
 use std::path::Path;
 
@@ -45,7 +45,9 @@ pub fn source(root: &Path, settings: CutSettings) -> Result<Recordings, ReadErro
     let name = manifest(&folders[0])?
         .source
         .unwrap_or_else(|| "recordings".to_owned());
-    Recordings::new(&name, folders, settings, |folder, _| open(folder))
+    Recordings::new(&name, folders, settings, |folder, settings| {
+        open_with(folder, settings.decoder)
+    })
 }
 
 /// Whether a folder is a neutral recording.
@@ -90,6 +92,10 @@ fn manifest(folder: &Path) -> Result<Manifest, ReadError> {
 /// # Errors
 /// When the manifest or a file it names is damaged or does not fit.
 pub fn open(root: &Path) -> Result<Recording, ReadError> {
+    open_with(root, DecoderChoice::Auto)
+}
+
+fn open_with(root: &Path, decoder: DecoderChoice) -> Result<Recording, ReadError> {
     let manifest = manifest(root)?;
     let path = root.join(FILE);
     let name = manifest.name.unwrap_or_else(|| {
@@ -114,7 +120,7 @@ pub fn open(root: &Path) -> Result<Recording, ReadError> {
             inside(root, &entry.file)?,
             &VideoSettings {
                 folder_fps: entry.rate.unwrap_or(30.0),
-                ..VideoSettings::default()
+                decoder,
             },
         )?;
         let start = nanoseconds(&path, entry.start)?;

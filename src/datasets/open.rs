@@ -9,7 +9,7 @@ use super::{
 };
 use crate::modality::{ClipFormat, DeclaredSettings};
 use crate::video::image::Image;
-use crate::video::{Video, folder};
+use crate::video::{Video, VideoSettings, folder};
 use std::path::Path;
 use std::sync::Arc;
 
@@ -171,7 +171,7 @@ impl VideoClips {
     /// When the video cannot be opened.
     pub fn open(path: &Path, settings: CutSettings) -> Result<Self, ReadError> {
         settings.check()?;
-        let video = Video::open(path)?;
+        let video = Video::open_with(path, &VideoSettings::by(settings.decoder))?;
         let name = path.file_stem().map_or_else(
             || "video".into(),
             |name| name.to_string_lossy().into_owned(),
@@ -206,6 +206,11 @@ impl ClipSource for VideoClips {
         Some(self.settings.format())
     }
 
+    fn decoders(&self) -> Vec<(String, usize)> {
+        let colour = self.recording.colour.iter();
+        colour.filter_map(|c| Some((c.decoder()?, 1))).collect()
+    }
+
     fn clip(&self, index: usize) -> Result<Outcome, ReadError> {
         if index >= self.len() {
             return Err(ReadError::OutOfRange {
@@ -235,5 +240,9 @@ impl ColourFrames for Frames {
             each(frame.index, frame.image);
         }
         Ok(())
+    }
+
+    fn decoder(&self) -> Option<String> {
+        Some(self.video.info().read_by())
     }
 }

@@ -44,6 +44,10 @@ pub trait ColourFrames: Send + Sync {
     /// # Errors
     /// When one cannot be read.
     fn read(&self, indices: &[usize], each: &mut dyn FnMut(usize, Image)) -> Result<(), ReadError>;
+    /// What decodes them, where they are a video.
+    fn decoder(&self) -> Option<String> {
+        None
+    }
 }
 
 /// Depth maps on the grid of the colour pictures, not turned.

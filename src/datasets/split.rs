@@ -189,6 +189,10 @@ impl ClipSource for Chosen {
         self.source.notes()
     }
 
+    fn decoders(&self) -> Vec<(String, usize)> {
+        self.source.decoders()
+    }
+
     fn lost(&self, index: usize) -> Vec<String> {
         let inside = self.indices.get(index);
         inside.map_or_else(Vec::new, |inside| self.source.lost(*inside))

@@ -21,6 +21,8 @@ pub struct Survey {
     pub excluded: Vec<Excluded>,
     /// What is absent and what to supply for it, with the number of recordings that lack it.
     pub notes: Vec<(String, usize)>,
+    /// What reads the videos, with the number of recordings.
+    pub decoders: Vec<(String, usize)>,
     pub format: ClipFormat,
     pub tally: Tally,
     pub inventory: Inventory,
@@ -58,6 +60,7 @@ pub fn survey(
         recordings: source.recordings().len(),
         excluded: source.excluded(),
         notes: source.notes(),
+        decoders: source.decoders(),
         inventory: Inventory::of(&format),
         format: format.clone(),
         tally: Tally::default(),

@@ -39,6 +39,7 @@ impl Convert {
         };
         let request = json!({
             "recordings": of_path(&absolute(&self.path)), "clips": source.len(), "cut": cut, "shards": settings,
+            "decoders": source.decoders(),
         });
         write(
             terminal,

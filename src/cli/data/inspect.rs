@@ -160,6 +160,9 @@ fn words(found: &Survey, source: &dyn ClipSource) -> String {
         source.modalities().join(" ")
     );
     text.push_str(&remarks(source));
+    for (decoder, count) in &found.decoders {
+        let _ = writeln!(text, "videos: {count} read by {decoder}");
+    }
     for (reason, count) in &found.tally.dropped {
         let _ = writeln!(text, "dropped: {count}, {reason}");
     }
