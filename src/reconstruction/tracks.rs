@@ -405,3 +405,61 @@ fn plain(name: &str) -> String {
     };
     name.chars().map(keep).collect()
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::clip::Intrinsics;
+    use crate::reconstruction::windows::windows;
+    use ndarray::ArrayD;
+
+    #[test]
+    fn a_signal_of_another_rate_is_blended_and_its_file_stays_in_the_folder() {
+        let name = "../pulse";
+        let mut track = SignalTrack::new(Description {
+            modality: name.to_owned(),
+            rate: Some(50.0),
+            ..Description::default()
+        });
+        for window in windows(3.5, 0.5).unwrap() {
+            let mut clip = Clip::empty("a", "test");
+            let mut valid = ArrayD::from_elem(vec![100], true);
+            valid[[99]] = false;
+            let signal = Signal {
+                values: ArrayD::from_elem(vec![100, 1], window.index as f32),
+                valid: Some(valid),
+            };
+            clip.set(Key::new(name), signal);
+            let mut place = Placement {
+                window: &window,
+                T_world_first: Rigid::identity(),
+            };
+            track.push(&clip, &mut place);
+        }
+        let values: Vec<f32> = track.rows.iter().map(|row| row[0]).collect();
+        assert_eq!(values.len(), 175);
+        assert!(values[..174].windows(2).all(|p| p[1] >= p[0]));
+        // Unknown on one side of the boundary, and at the very end.
+        assert_eq!((values[99], values[174].is_nan()), (1.0, true));
+        let folder = tempfile::tempdir().unwrap();
+        let inside = folder.path().join("in");
+        std::fs::create_dir(&inside).unwrap();
+        let intrinsics = Intrinsics {
+            fx: 1.0,
+            fy: 1.0,
+            cx: 0.0,
+            cy: 0.0,
+            width: 1,
+            height: 1,
+        };
+        let mut files = Files::new(&inside, intrinsics, (0, 8.0));
+        track.write(&mut files).unwrap();
+        let (facts, names) = files.finish().unwrap();
+        assert_eq!(names, ["___pulse.npz"]);
+        assert_eq!(
+            (facts[0].rate, facts[0].shape.as_slice()),
+            (Some(50.0), [175, 1].as_slice())
+        );
+        assert!(inside.join("___pulse.npz").is_file());
+    }
+}
