@@ -225,15 +225,16 @@ impl Plan {
                         clip: pairs.ids()[index].clone(),
                         error,
                     })?;
-                    let part = |baseline: &Box<dyn Baseline>| {
+                    let baselines = self.baselines.iter();
+                    let parts = baselines.map(|baseline| {
                         let mut mean = Mean::default();
                         baseline
                             .samples(&clip)
                             .iter()
                             .for_each(|some| mean.add(some));
                         mean
-                    };
-                    Ok(self.baselines.iter().map(part).collect())
+                    });
+                    Ok(parts.collect())
                 })
                 .collect();
             for part in parts {
@@ -324,10 +325,10 @@ impl Plan {
         let mut sets: Vec<SetScore> = Vec::new();
         for (position, group) in self.groups.iter().enumerate() {
             for (index, column) in group.columns.iter().enumerate() {
-                let value = |row: &Option<&Scored>| {
-                    row.map_or(Outcome::Null, |scored| scored[position].value(index))
-                };
-                filled.insert(column.name.clone(), rows.iter().map(value).collect());
+                let values = rows
+                    .iter()
+                    .map(|row| row.map_or(Outcome::Null, |scored| scored[position].value(index)));
+                filled.insert(column.name.clone(), values.collect());
             }
             let features = rows
                 .iter()

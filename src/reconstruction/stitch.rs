@@ -218,6 +218,12 @@ impl Stitcher {
     }
 }
 
+/// Whether several windows of a modality need the camera's path, which says where each of them starts.
+#[must_use]
+pub fn follows_camera(modality: &str) -> bool {
+    track(modality, &BTreeMap::new()).follows_camera()
+}
+
 fn track(modality: &str, described: &BTreeMap<String, Description>) -> Box<dyn Track> {
     let mut description = described.get(modality).cloned().unwrap_or_default();
     modality.clone_into(&mut description.modality);

@@ -27,6 +27,11 @@ pub trait Track: Any + Debug + Send + Sync {
     /// When the disk refuses.
     fn write(&self, files: &mut Files<'_>) -> Result<(), FolderError>;
 
+    /// Whether it stands in the world, so that several windows need the camera's path to lie beside each other.
+    fn follows_camera(&self) -> bool {
+        false
+    }
+
     /// What the page draws; rows beyond the timeline are cut, missing ones unknown.
     fn parts(&self, timeline: &Timeline<'_>) -> Vec<Part>;
 }

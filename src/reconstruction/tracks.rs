@@ -261,6 +261,10 @@ impl Track for JointPath {
         })
     }
 
+    fn follows_camera(&self) -> bool {
+        !self.part.in_camera
+    }
+
     fn parts(&self, timeline: &Timeline<'_>) -> Vec<Part> {
         let at = |(t, i): (usize, usize)| {
             let (p, k) = (self.poses[t][i / 3], i % 3);

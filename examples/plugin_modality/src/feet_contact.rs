@@ -23,6 +23,7 @@ inventory::submit! { LinkedEntry { origin: "plugin_modality 0.1", text: include_
 inventory::submit! { SignalCode { name: NAME, about: "Feet that are low and slow.", derive } }
 inventory::submit! { MetricEntry(&ContactMetrics) }
 
+#[allow(clippy::unnecessary_wraps, reason = "the type of `SignalCode::derive`")]
 fn derive(clip: &Clip, _: &DeclaredSettings) -> Result<Option<Signal>, ModalityError> {
     let Some(body) = clip.body() else {
         return Ok(None);

@@ -84,6 +84,7 @@ impl Value for ObjectTrack {
 }
 
 /// The palm: x towards the index finger's side, y towards the fingers.
+#[allow(clippy::unnecessary_wraps, reason = "the type of `SignalCode::derive`")]
 fn derive(clip: &Clip, settings: &DeclaredSettings) -> Result<Option<Signal>, ModalityError> {
     let (Some(camera), Some(hand)) = (clip.camera(), clip.right_hand()) else {
         return Ok(None);
@@ -156,10 +157,10 @@ impl ObjectPose {
 }
 
 impl Modality for ObjectPose {
-    fn name(&self) -> &str {
+    fn name(&self) -> &'static str {
         NAME
     }
-    fn about(&self) -> &str {
+    fn about(&self) -> &'static str {
         "Pose of what the right hand holds."
     }
     fn rate(&self) -> f64 {
@@ -179,7 +180,7 @@ impl Modality for ObjectPose {
     fn lengths(&self) -> Lengths {
         Lengths::Metric
     }
-    fn frame(&self) -> &str {
+    fn frame(&self) -> &'static str {
         "first camera of the clip (x right, y down, z forward)"
     }
 
@@ -266,6 +267,10 @@ impl Track for ObjectPath {
             scale,
         );
         Ok(())
+    }
+
+    fn follows_camera(&self) -> bool {
+        true
     }
 
     fn parts(&self, _: &Timeline<'_>) -> Vec<Part> {
