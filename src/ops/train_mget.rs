@@ -292,7 +292,7 @@ impl Op for TrainMget {
         settings: &TrainMgetSettings,
         context: &mut dyn StageContext,
     ) -> Result<Value, StageError> {
-        run::Run::prepare(settings, context)?.train(context)
+        run::run(settings, context)
     }
 }
 

@@ -1,14 +1,11 @@
 //! What is reconstructed: a video, or a stored clip with its truth.
 
-use super::ReconstructSettings;
-use crate::clip::store::ClipSet;
+use super::error::ReconstructError;
+use super::lens::LensSettings;
+use super::windows::Window;
 use crate::clip::{Clip, Intrinsics, RGB, Rgb};
-use crate::experiment::{Code, InputArtifact, StageError};
-use crate::formats::ReadError;
 use crate::geometry::rigid::Rigid;
 use crate::modality::ClipFormat;
-use crate::reconstruction::lens::{LensError, LensSettings};
-use crate::reconstruction::windows::Window;
 use crate::video::image::Image;
 use crate::video::{self, Video};
 use crate::view::Fact;
@@ -21,18 +18,26 @@ use std::fmt::Display;
 const CLIP_SECONDS: f64 = 2.0;
 
 /// An opened recording.
-pub(super) struct Recording {
+#[derive(Debug)]
+pub struct Recording {
+    /// The video's or the clip's name.
     pub title: String,
+    /// How much of it is reconstructed.
     pub seconds: f64,
+    /// Of the square frames that the model sees.
     pub intrinsics: Intrinsics,
     /// World pose of the first camera.
     pub first: Rigid,
+    /// What is assumed of it, and where that comes from.
     pub assumptions: Vec<Fact>,
+    /// `synthetic`, ...
     pub badges: Vec<Badge>,
+    /// The clip without its video.
     pub truth: Option<Clip>,
     frames: Frames,
 }
 
+#[derive(Debug)]
 enum Frames {
     Video { video: Video, start: f64 },
     Clip(Rgb),
@@ -49,47 +54,29 @@ pub(super) struct Stream<'a> {
 }
 
 impl Recording {
-    /// Opens what the settings name.
-    pub fn open(
-        settings: &ReconstructSettings,
-        clips: Option<&InputArtifact>,
-        format: &ClipFormat,
-    ) -> Result<Self, StageError> {
-        match (&settings.video, clips) {
-            (Some(path), _) => {
-                let video = Video::open_with(path, &settings.reading)
-                    .map_err(|error| unreadable(&error))?;
-                Self::video(settings, video, format)
-            }
-            (None, Some(artifact)) => Self::clip(settings, artifact, format),
-            (None, None) => Err(input("nothing to reconstruct", "name a file in `video`")),
-        }
-    }
-
-    fn video(
-        settings: &ReconstructSettings,
+    /// A video from `start` on, at most `limit` seconds of it, for a model that takes clips of `format`.
+    ///
+    /// # Errors
+    /// When nothing is left of the video, or what is said of its camera cannot be.
+    pub fn of_video(
         video: Video,
+        [start, limit]: [Option<f64>; 2],
+        camera: &LensSettings,
         format: &ClipFormat,
-    ) -> Result<Self, StageError> {
+    ) -> Result<Self, ReconstructError> {
+        let start = start.unwrap_or(0.0);
         let info = video.info().clone();
-        let left = info.seconds() - settings.start;
+        let left = info.seconds() - start;
         if info.frames == 0 || left <= 0.0 || !left.is_finite() {
-            return Err(input(
-                format_args!(
-                    "`{}` has {} frames, {:.2} s; nothing is left from {:.2} s on",
-                    video.path().display(),
-                    info.frames,
-                    info.seconds(),
-                    settings.start
-                ),
-                "choose a smaller `start`, or another video",
-            ));
+            return Err(ReconstructError::NothingLeft {
+                path: video.path().to_owned(),
+                frames: info.frames,
+                seconds: info.seconds(),
+                start,
+            });
         }
         let size = [info.width, info.height];
-        let intrinsics = settings
-            .lens
-            .intrinsics(size, format.size as u32)
-            .map_err(|error| lens(&error))?;
+        let intrinsics = camera.intrinsics(size, format.size as u32)?;
         let square = info.width.min(info.height);
         let mut assumptions = vec![
             fact(
@@ -130,46 +117,35 @@ impl Recording {
                 format_args!("{} degrees, from the file", info.rotation),
             ));
         }
-        assumptions.extend(said(&settings.lens, &intrinsics));
+        assumptions.extend(said(camera, &intrinsics));
         Ok(Self {
             title: video.path().file_stem().map_or_else(
                 || "video".into(),
                 |stem| stem.to_string_lossy().into_owned(),
             ),
-            seconds: settings.seconds.map_or(left, |limit| left.min(limit)),
+            seconds: limit.map_or(left, |limit| left.min(limit)),
             intrinsics,
-            first: settings.lens.first_pose().map_err(|error| lens(&error))?,
+            first: camera.first_pose()?,
             assumptions,
             badges: Vec::new(),
             truth: None,
-            frames: Frames::Video {
-                video,
-                start: settings.start,
-            },
+            frames: Frames::Video { video, start },
         })
     }
 
-    fn clip(
-        settings: &ReconstructSettings,
-        artifact: &InputArtifact,
+    /// A stored clip; what it knows of its camera goes before `camera`, and its truth is shown beside the prediction.
+    ///
+    /// # Errors
+    /// When it has no colour video, or what is said of its camera cannot be.
+    pub fn of_clip(
+        mut clip: Clip,
+        camera: &LensSettings,
         format: &ClipFormat,
-    ) -> Result<Self, StageError> {
-        let root = artifact.path.join(&settings.split);
-        let clips = ClipSet::open(&root).map_err(StageError::other)?;
-        if settings.clip >= clips.len() {
-            return Err(input(
-                format_args!("split `{}` has {} clips", settings.split, clips.len()),
-                "choose a smaller `clip`",
-            ));
-        }
-        let mut clip = clips.clip(settings.clip).map_err(StageError::other)?;
-        let rgb = clip.take(RGB).ok_or_else(|| {
-            input(
-                format_args!("clip `{}` has no colour video", clip.id),
-                "choose another clip",
-            )
+    ) -> Result<Self, ReconstructError> {
+        let rgb = clip.take(RGB).ok_or_else(|| ReconstructError::NoColour {
+            clip: clip.id.clone(),
         })?;
-        let mut lens_settings = settings.lens;
+        let mut lens_settings = *camera;
         let camera = clip.camera();
         let known = camera.and_then(|camera| camera.intrinsics);
         let mut up_known = false;
@@ -184,9 +160,7 @@ impl Recording {
         let size = format.size as u32;
         let intrinsics = match known {
             Some(known) => known,
-            None => lens_settings
-                .intrinsics([size, size], size)
-                .map_err(|error| lens(&error))?,
+            None => lens_settings.intrinsics([size, size], size)?,
         };
         let [mut lens_fact, mut up_fact] = said(&lens_settings, &intrinsics);
         if known.is_some() {
@@ -210,7 +184,7 @@ impl Recording {
             title: clip.id.clone(),
             seconds: CLIP_SECONDS,
             intrinsics,
-            first: lens_settings.first_pose().map_err(|error| lens(&error))?,
+            first: lens_settings.first_pose()?,
             assumptions,
             badges,
             truth: Some(clip),
@@ -219,11 +193,11 @@ impl Recording {
     }
 
     /// The frames of these windows, as the model takes them.
-    pub fn stream<'a>(
+    pub(super) fn stream<'a>(
         &'a self,
         windows: &[Window],
         format: &'a ClipFormat,
-    ) -> Result<Stream<'a>, StageError> {
+    ) -> Result<Stream<'a>, ReconstructError> {
         let (chosen, decoded, clip) = match &self.frames {
             Frames::Clip(rgb) => (Vec::new(), None, Some(rgb)),
             Frames::Video { video, start } => {
@@ -233,9 +207,7 @@ impl Recording {
                     schedule.clip(first, format.video_rate, format.frames)
                 };
                 let chosen: Vec<Vec<usize>> = windows.iter().map(of).collect();
-                let decoded = video
-                    .chosen(chosen.concat())
-                    .map_err(|error| unreadable(&error))?;
+                let decoded = video.chosen(chosen.concat())?;
                 (chosen, Some(decoded), None)
             }
         };
@@ -251,7 +223,7 @@ impl Recording {
 
 impl Stream<'_> {
     /// The frames of a window; windows are asked for in their order.
-    pub fn window(&mut self, index: usize) -> Result<Rgb, StageError> {
+    pub(super) fn window(&mut self, index: usize) -> Result<Rgb, ReconstructError> {
         if let Some(clip) = self.clip {
             return Ok(clip.clone());
         }
@@ -263,14 +235,7 @@ impl Stream<'_> {
         for (mut slot, wanted) in frames.outer_iter_mut().zip(chosen) {
             while !self.held.contains_key(wanted) {
                 let frame = self.decoded.as_mut().and_then(Iterator::next);
-                let frame = frame
-                    .ok_or_else(|| {
-                        input(
-                            format_args!("the video ends before its frame {wanted}"),
-                            "check the file, or convert it with `ffmpeg`",
-                        )
-                    })?
-                    .map_err(|error| unreadable(&error))?;
+                let frame = frame.ok_or(ReconstructError::Ends { before: *wanted })??;
                 self.held
                     .insert(frame.index, frame.image.square(side as u32));
             }
@@ -314,20 +279,4 @@ fn said(settings: &LensSettings, lens: &Intrinsics) -> [Fact; 2] {
         fact("Intrinsics", format_args!("{}, {from}", words(lens))),
         fact("Up", up),
     ]
-}
-
-pub(super) fn input(message: impl Display, help: &str) -> StageError {
-    StageError::Input {
-        code: Code::E0601,
-        message: message.to_string(),
-        help: help.to_owned(),
-    }
-}
-
-fn unreadable(error: &ReadError) -> StageError {
-    input(error, "check the file, or convert it with `ffmpeg`")
-}
-
-fn lens(error: &LensError) -> StageError {
-    input(error, "correct `lens`")
 }
