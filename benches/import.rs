@@ -12,10 +12,10 @@ mod released;
 mod torch;
 
 use reviv::decoding::DecodingSettings;
-use reviv::decoding::reconstructor::{GenerationRequest, Reconstructor};
 use reviv::engine::Compute;
 use reviv::import::{Checkpoint, ImportOptions, import};
 use reviv::mget::Size;
+use reviv::model::{GenerationRequest, Model};
 use reviv::world::{World, WorldSettings};
 use std::fs::File;
 use std::path::{Path, PathBuf};
@@ -153,7 +153,7 @@ fn decode(folder: &Path) {
     let world = World::new(WorldSettings::default(), 7);
     let clip = world.clip(0);
     let start = Instant::now();
-    let model = Reconstructor::open(folder, &Compute::cpu()).unwrap();
+    let model = Model::open(folder, &Compute::cpu()).unwrap();
     println!("opened in {:.1} s", start.elapsed().as_secs_f64());
     let inputs = ["rgb".to_owned()];
     let targets = ["body", "camera", "gaze", "left_hand", "right_hand"].map(str::to_owned);
@@ -164,7 +164,7 @@ fn decode(folder: &Path) {
         seed: 0,
     };
     let start = Instant::now();
-    let made = model.reconstruct(&[clip], &[0], &wish).unwrap();
+    let made = model.predict(&[clip], &[0], &wish).unwrap();
     for (name, confidence) in &made[0].confidence {
         println!("{name}: {} samples", confidence.len());
     }

@@ -95,8 +95,13 @@ impl super::Run for Reconstruct {
         })
         .map_err(|error| tell(terminal, &error))?;
         finished(terminal, &outcome, &interrupt)?;
-        let artifact = artifact(&self.place.runs, &outcome).map_err(|e| tell(terminal, &e))?;
-        publish(&artifact, &target).map_err(|error| tell(terminal, &error))?;
+        let artifact = outcome.artifacts.get(STAGE).ok_or_else(|| {
+            Failure::input(
+                format!("the experiment has no stage `{STAGE}`"),
+                format!("`{FILE}` names it so"),
+            )
+        })?;
+        publish(&artifact.join(FOLDER), &target).map_err(|error| tell(terminal, &error))?;
         Self::report(terminal, &outcome, &target)
     }
 }
@@ -269,17 +274,6 @@ fn finished(terminal: &Terminal, outcome: &Outcome, interrupt: &Interrupt) -> Re
             Err(Failure::Ended(worst.unwrap_or(2)))
         }
     }
-}
-
-/// Where the reconstruction lies in the cache.
-fn artifact(runs: &Path, outcome: &Outcome) -> Result<PathBuf, RunError> {
-    let schedule: Schedule = files::read_json(&outcome.run.path().join("plan.json"))?;
-    let work = schedule.works.iter().find(|work| work.stage == STAGE);
-    let work = work.ok_or_else(|| RunError::Request {
-        message: format!("the experiment has no stage `{STAGE}`"),
-        help: format!("`{FILE}` names it so"),
-    })?;
-    Ok(cache_of(runs).path(&work.key).join(FOLDER))
 }
 
 /// The files of the earlier result in `target`, which may go; `None` where it holds anything else.

@@ -66,6 +66,19 @@ pub trait ClipSource: Send + Sync {
     /// # Errors
     /// When a file cannot be read or is malformed, or `index >= len()`.
     fn clip(&self, index: usize) -> Result<Outcome, ReadError>;
+
+    /// Makes clip number `index` with at least these modalities, as far as it has them; others may be left out.
+    ///
+    /// # Errors
+    /// As [`ClipSource::clip`].
+    fn clip_with(&self, index: usize, _modalities: &[&str]) -> Result<Outcome, ReadError> {
+        self.clip(index)
+    }
+
+    /// Whether clip number `index` may have a modality: false only where that is known without making it.
+    fn may_have(&self, _index: usize, _modality: &str) -> bool {
+        true
+    }
 }
 
 /// A recording that gives no clips.

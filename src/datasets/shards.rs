@@ -269,6 +269,33 @@ fn described_format(root: &Path) -> Result<Option<ClipFormat>, ReadError> {
         .map_err(|error| ReadError::malformed(&path, Position::File, format!("`format`: {error}")))
 }
 
+impl ClipSource for ClipSet {
+    fn name(&self) -> &'static str {
+        "clips"
+    }
+
+    fn len(&self) -> usize {
+        ClipSet::len(self)
+    }
+
+    fn modalities(&self) -> Vec<String> {
+        self.shards().modalities().map(str::to_owned).collect()
+    }
+
+    fn clip(&self, index: usize) -> Result<Outcome, ReadError> {
+        Ok(Outcome::Clip(Box::new(ClipSet::clip(self, index)?)))
+    }
+
+    fn clip_with(&self, index: usize, modalities: &[&str]) -> Result<Outcome, ReadError> {
+        let clip = ClipSet::clip_with(self, index, modalities)?;
+        Ok(Outcome::Clip(Box::new(clip)))
+    }
+
+    fn may_have(&self, index: usize, modality: &str) -> bool {
+        self.shards().has(index, modality)
+    }
+}
+
 impl ClipSource for ShardClips {
     fn name(&self) -> &str {
         &self.name

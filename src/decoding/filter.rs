@@ -8,9 +8,11 @@ use serde::{Deserialize, Serialize};
 /// How a token is taken from its logits.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Filter {
+    /// How many of the most likely tokens stay.
     pub top_k: TopK,
     /// Tokens after the one that crosses this mass are dropped; 0 (or 1) is off.
     pub top_p: f64,
+    /// 0 takes the most likely token.
     pub temperature: f64,
     pub sampling: Sampling,
 }
@@ -59,6 +61,7 @@ pub const ZERO_TEMPERATURE: f64 = 1e-10;
 /// A token and what is known about how sure it is.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Pick {
+    /// The token.
     pub token: u32,
     /// Its probability after filter and temperature.
     pub probability: f32,

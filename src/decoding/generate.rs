@@ -26,7 +26,9 @@ pub struct GeneratedTokens {
 /// What a step saw and did, for checks against a reference.
 #[derive(Debug, Clone, PartialEq)]
 pub struct StepTrace {
+    /// Of the model's list.
     pub modality: usize,
+    /// The step that decided it.
     pub step: usize,
     /// The target positions of each sample.
     pub positions: Vec<Vec<u32>>,
@@ -36,6 +38,7 @@ pub struct StepTrace {
     pub unconditional: Vec<f32>,
     /// What was sampled from.
     pub combined: Vec<f32>,
+    /// Every decision, in order.
     pub picks: Vec<Pick>,
     /// The decided positions of each sample, ascending.
     pub selected: Vec<Vec<u32>>,

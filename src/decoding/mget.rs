@@ -14,6 +14,7 @@ pub struct MgetTokens<'m> {
 }
 
 impl<'m> MgetTokens<'m> {
+    /// The model, answering for tokens.
     #[must_use]
     pub fn new(model: &'m Mget) -> Self {
         let modalities = model

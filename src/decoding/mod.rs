@@ -2,15 +2,13 @@
 //!
 //! Read in this order: [`settings`] (a registry entry), [`schedule`] (tokens and temperature per step), [`plan`] (which target
 //! when, from what), [`model`] (what it needs of a model), [`filter`] (logits to a token), [`mod@generate`] (the
-//! entry), `round` (**the loop**), [`mget`] (the model), [`reconstructor`] (a model folder with its tokenizers as one function
-//! from clips to clips).
+//! entry), `round` (**the loop**), [`mget`] (the model). [`crate::model`] puts it between tokenizers.
 
 pub mod filter;
 pub mod generate;
 pub mod mget;
 pub mod model;
 pub mod plan;
-pub mod reconstructor;
 mod round;
 pub mod schedule;
 pub mod settings;
@@ -18,5 +16,4 @@ pub mod settings;
 pub use generate::{Generated, GeneratedTokens, generate, generate_samples};
 pub use mget::MgetTokens;
 pub use model::{DecodingError, Sample, Slot, TokenModality, TokenModel};
-pub use reconstructor::{GenerationRequest, Reconstructed, Reconstructor, ReconstructorError};
 pub use settings::DecodingSettings;

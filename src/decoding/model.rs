@@ -6,6 +6,7 @@ use std::ops::Range;
 /// One modality as decoding sees it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct TokenModality {
+    /// The modality.
     pub name: String,
     /// Tokens per sample.
     pub tokens: usize,

@@ -13,6 +13,7 @@ pub struct Chain {
 /// Targets that are decided together, step by step.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Group {
+    /// What is generated together.
     pub targets: Vec<Target>,
     /// By modality: not seen by the pass without conditions.
     pub hidden: Vec<bool>,
@@ -25,6 +26,7 @@ pub struct Group {
 pub struct Target {
     /// Index of the modality.
     pub modality: usize,
+    /// How its tokens are decided.
     pub settings: TargetSettings,
     /// Tokens decided by each step.
     pub counts: Vec<usize>,

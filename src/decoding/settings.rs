@@ -35,20 +35,24 @@ pub enum Order {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct TargetSettings {
+    /// Which positions a step decides.
     pub scheme: Scheme,
     /// Decoding steps; fewer are taken where there are fewer tokens.
     #[schemars(range(min = 1))]
     pub steps: usize,
+    /// How many tokens each step decides.
     pub schedule: TokenSchedule,
     /// 0 takes the most likely token.
     #[schemars(range(min = 0.0))]
     pub temperature: f64,
+    /// How the temperature changes over the steps.
     pub temperature_schedule: TemperatureSchedule,
     /// Classifier-free guidance: logits are `without + scale * (with - without)`. 1 is off and costs half.
     pub guidance: f64,
     /// Mass of the nucleus; 0 is off.
     #[schemars(range(min = 0.0, max = 1.0))]
     pub top_p: f64,
+    /// How many of the most likely tokens stay.
     pub top_k: TopK,
     pub sampling: Sampling,
 }
@@ -84,18 +88,21 @@ impl TargetSettings {
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct TargetChanges {
+    /// Which positions a step decides.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub scheme: Option<Scheme>,
     /// Decoding steps.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schemars(range(min = 1))]
     pub steps: Option<usize>,
+    /// How many tokens each step decides.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub schedule: Option<TokenSchedule>,
     /// 0 takes the most likely token.
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schemars(range(min = 0.0))]
     pub temperature: Option<f64>,
+    /// How the temperature changes over the steps.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub temperature_schedule: Option<TemperatureSchedule>,
     /// Scale of the classifier-free guidance; 1 is off.
@@ -105,6 +112,7 @@ pub struct TargetChanges {
     #[serde(skip_serializing_if = "Option::is_none")]
     #[schemars(range(min = 0.0, max = 1.0))]
     pub top_p: Option<f64>,
+    /// How many of the most likely tokens stay.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub top_k: Option<TopK>,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -119,6 +127,7 @@ pub struct TargetChanges {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
 pub struct DecodingSettings {
+    /// How targets depend on each other.
     pub order: Order,
     /// With `order: independent`: targets that are chained nevertheless, each list in its order.
     pub chains: Vec<Vec<String>>,

@@ -5,8 +5,9 @@ use super::table::{Cell, Row, RowKind, Table};
 use std::fmt::Write as _;
 
 /// How a table is written.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Format {
+    #[default]
     Terminal,
     Markdown,
     Latex,

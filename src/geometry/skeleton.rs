@@ -92,6 +92,72 @@ pub const BODY: Skeleton = Skeleton {
     ],
 };
 
+/// A joint of the body, in the order of [`BODY`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[allow(missing_docs, reason = "the names say it")]
+pub enum Joint {
+    Pelvis,
+    LeftHip,
+    RightHip,
+    LeftKnee,
+    RightKnee,
+    Spine2,
+    LeftAnkle,
+    RightAnkle,
+    Spine3,
+    LeftFoot,
+    RightFoot,
+    Neck,
+    LeftCollar,
+    RightCollar,
+    Head,
+    LeftShoulder,
+    RightShoulder,
+    LeftElbow,
+    RightElbow,
+    LeftWrist,
+    RightWrist,
+}
+
+impl From<Joint> for usize {
+    fn from(joint: Joint) -> usize {
+        joint as usize
+    }
+}
+
+/// A joint of a hand, in the order of [`HAND`]; `1` is the knuckle.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[allow(missing_docs, reason = "the names say it")]
+pub enum HandJoint {
+    Wrist,
+    Index1,
+    Index2,
+    Index3,
+    Middle1,
+    Middle2,
+    Middle3,
+    Pinky1,
+    Pinky2,
+    Pinky3,
+    Ring1,
+    Ring2,
+    Ring3,
+    Thumb1,
+    Thumb2,
+    Thumb3,
+    ThumbTip,
+    IndexTip,
+    MiddleTip,
+    RingTip,
+    PinkyTip,
+}
+
+impl From<HandJoint> for usize {
+    fn from(joint: HandJoint) -> usize {
+        joint as usize
+    }
+}
+
 impl Skeleton {
     /// (parent, child) of every joint but the root.
     pub fn bones(&self) -> impl Iterator<Item = (usize, usize)> + '_ {

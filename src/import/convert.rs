@@ -7,9 +7,9 @@ use super::part::Part;
 use super::source::{Source, expand};
 use super::statistics::{self, Statistics};
 use super::vda;
-use crate::decoding::reconstructor::ModelManifest;
 use crate::labelling::DepthLabelKind;
 use crate::mget::MgetSpec;
+use crate::model::ModelManifest;
 use serde_json::{Map, Value, json};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -52,7 +52,7 @@ pub struct PartReport {
 const FORMAT: u64 = 2;
 
 /// Imports released files (weights, statistics, or folders of them) into `folder`, which must not exist yet: a model that
-/// [`crate::decoding::Reconstructor`] opens, and a `manifest.json` that accounts for every entry.
+/// [`crate::model::Model`] opens, and a `manifest.json` that accounts for every entry.
 ///
 /// # Errors
 /// When a file is not what it seems, an entry is unknown, or something that would be dropped is not redundant. Nothing is left

@@ -33,6 +33,27 @@ impl Default for Size {
 }
 
 impl Size {
+    /// The smallest size that still learns.
+    pub const LAPTOP_SMALL: Self = Self::of(96, 4, 2);
+    /// For two cores and minutes.
+    pub const LAPTOP: Self = Self::of(144, 6, 3);
+    /// The paper's small model.
+    pub const TINY: Self = Self::of(384, 6, 6);
+    /// The paper's model.
+    pub const BASE: Self = Self::of(768, 12, 12);
+    /// The release's largest usable size.
+    pub const LARGE: Self = Self::of(1020, 15, 24);
+
+    const fn of(width: usize, heads: usize, depth: usize) -> Self {
+        Self {
+            width,
+            heads,
+            encoder_depth: depth,
+            decoder_depth: depth,
+            hidden: 0,
+        }
+    }
+
     /// The hidden width of the SwiGLU.
     #[must_use]
     pub fn hidden(&self) -> usize {

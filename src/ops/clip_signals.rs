@@ -1,12 +1,9 @@
 //! The signals of a clips artifact: which modalities it has, and reading one of them split by split.
 
 use crate::clip::store::ClipSet;
-use crate::clip::{Clip, Signal};
 use crate::experiment::{Code, Description, InputArtifact, Problem, StageError};
 use crate::modality::{self, ClipFormat, Modality};
-use rayon::prelude::*;
 use serde_json::Value;
-use std::ops::Range;
 use std::path::Path;
 
 /// The splits a clips artifact may have.
@@ -65,34 +62,4 @@ pub(super) fn open_split(clips: &Path, split: &str) -> Result<Option<ClipSet>, S
     ClipSet::open(&folder)
         .map(Some)
         .map_err(|error| damaged(&error.to_string()))
-}
-
-/// A clip with one signal taken out.
-pub(super) struct Extracted {
-    pub clip: Clip,
-    pub signal: Signal,
-}
-
-/// The clips `range` of `set` that have `modality`, in order, read on all cores. `beside` names modalities to read too.
-pub(super) fn extract(
-    set: &ClipSet,
-    modality: &dyn Modality,
-    beside: &[&str],
-    range: Range<usize>,
-) -> Result<Vec<Extracted>, StageError> {
-    let mut wanted = vec![modality.name()];
-    wanted.extend(beside.iter().filter(|name| **name != modality.name()));
-    let found: Result<Vec<Option<Extracted>>, StageError> = range
-        .into_par_iter()
-        .map(|index| {
-            let clip = set
-                .clip_with(index, &wanted)
-                .map_err(|error| damaged(&error.to_string()))?;
-            let signal = modality
-                .extract(&clip)
-                .map_err(|error| damaged(&error.to_string()))?;
-            Ok(signal.map(|signal| Extracted { clip, signal }))
-        })
-        .collect();
-    Ok(found?.into_iter().flatten().collect())
 }

@@ -4,13 +4,13 @@
 //! The artifact is a copy, so that what it was made from can be seen and used whatever becomes of the folder. Its identity is
 //! that of the folder's bytes, wherever it lies.
 
-use crate::decoding::reconstructor::{FILE, ModelManifest};
 use crate::experiment::{
     ArtifactKind, Code, Description, FileInput, FilePath, Inputs, Op, OpEntry, Port, Problem,
     StageContext, StageError, StagePlan, TokenFacts,
 };
 use crate::mget::MgetSpec;
 use crate::mget::stored::{WEIGHTS, read_spec};
+use crate::model::{FILE, ModelManifest};
 use crate::run::files::{copy_tree, size_below};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};

@@ -5,7 +5,7 @@
 
 use crate::clip::Clip;
 use crate::clip::store::ClipSet;
-use crate::decoding::{DecodingSettings, GenerationRequest, Reconstructor, ReconstructorError};
+use crate::decoding::DecodingSettings;
 use crate::engine::Compute;
 use crate::evaluation::runtime::runtime;
 use crate::experiment::{
@@ -14,6 +14,7 @@ use crate::experiment::{
 };
 use crate::masking::PIXELS;
 use crate::mget::MgetSpec;
+use crate::model::{GenerationRequest, Model, ModelError};
 use crate::reconstruction::predictions::{FLOOR, PredictionsWriter, ScaleStatus, SignalNote};
 use crate::run::environment::Stopwatch;
 use schemars::JsonSchema;
@@ -221,18 +222,18 @@ impl Op for Predict {
     ) -> Result<Value, StageError> {
         let _memory = crate::engine::memory::Stage;
         let model = artifact(context, "model")?;
-        let reconstructor = Reconstructor::open(&model.path, &Compute::cpu()).map_err(refused)?;
+        let model = Model::open(&model.path, &Compute::cpu()).map_err(refused)?;
         let root = artifact(context, "clips")?.path.join(&settings.split);
         let clips = ClipSet::open(&root).map_err(StageError::other)?;
         let total = clips.len().min(settings.limit.unwrap_or(usize::MAX));
-        let targets = settings.targets(reconstructor.names());
+        let targets = settings.targets(model.names());
         let request = GenerationRequest {
             inputs: &settings.inputs,
             targets: &targets,
             decoding: &settings.decoding.settings,
             seed: context.seed(),
         };
-        let notes = notes(&reconstructor, &targets).map_err(refused)?;
+        let notes = notes(&model, &targets).map_err(refused)?;
         let create = |folder: &Path, system: &str| {
             PredictionsWriter::create(folder, system, notes.clone()).map_err(StageError::other)
         };
@@ -262,17 +263,17 @@ impl Op for Predict {
             let ids: Vec<u64> = (done..done + count).map(|i| i as u64).collect();
             let conditioning = times
                 .take("encode", count, || {
-                    reconstructor.encode_inputs(&batch, request.inputs)
+                    model.encode_inputs(&batch, request.inputs)
                 })
                 .map_err(refused)?;
             let tokens = times
                 .take("generate", count, || {
-                    reconstructor.generate(&conditioning, &ids, &request)
+                    model.generate(&conditioning, &ids, &request)
                 })
                 .map_err(refused)?;
             let made = times
                 .take("detokenize", count, || {
-                    reconstructor.decode(&batch, &tokens, &request)
+                    model.decode(&batch, &tokens, &request)
                 })
                 .map_err(refused)?;
             for one in made {
@@ -281,9 +282,7 @@ impl Op for Predict {
                     .map_err(StageError::other)?;
             }
             if let Some(floor) = &mut floor {
-                let back = reconstructor
-                    .round_trip(&batch, &targets)
-                    .map_err(refused)?;
+                let back = model.round_trip(&batch, &targets).map_err(refused)?;
                 for clip in back {
                     floor
                         .add(&clip, &BTreeMap::new())
@@ -347,12 +346,9 @@ impl Times {
 }
 
 /// What the numbers of every generated modality are.
-fn notes(
-    reconstructor: &Reconstructor,
-    targets: &[String],
-) -> Result<BTreeMap<String, SignalNote>, ReconstructorError> {
+fn notes(model: &Model, targets: &[String]) -> Result<BTreeMap<String, SignalNote>, ModelError> {
     let note = |name: &String| {
-        let modality = reconstructor.modality(name)?;
+        let modality = model.modality(name)?;
         let scale = ScaleStatus::of(modality);
         let mut units = modality.units();
         units.dedup();
@@ -367,24 +363,22 @@ fn notes(
     targets.iter().map(note).collect()
 }
 
-/// A model or a clip that the reconstructor refuses, with the way out.
-pub(super) fn refused(error: ReconstructorError) -> StageError {
+/// A model or a clip that the model refuses, with the way out.
+pub(super) fn refused(error: ModelError) -> StageError {
     let help = match &error {
-        ReconstructorError::Io { .. } | ReconstructorError::Decoding(_) => {
+        ModelError::Io { .. } | ModelError::Decoding(_) | ModelError::Stored(_) => {
             return StageError::other(error);
         }
-        ReconstructorError::NotAModel { .. } => {
+        ModelError::NotAModel { .. } => {
             "`reviv run experiments/quickstart.yaml` trains a model, `reviv import` reads released weights"
         }
-        ReconstructorError::OtherTokenizer { .. } | ReconstructorError::OtherGrid { .. } => {
+        ModelError::OtherTokenizer { .. } | ModelError::OtherGrid { .. } => {
             "import or train the model together with its tokenizers"
         }
-        ReconstructorError::MissingInput { .. } => {
-            "leave it out of `inputs`, or use clips that have it"
+        ModelError::MissingInput { .. } => "leave it out of `inputs`, or use clips that have it",
+        ModelError::UnknownModality { .. } | ModelError::Clip { .. } | ModelError::Tokenizer(_) => {
+            "use clips of the form the model was trained on"
         }
-        ReconstructorError::UnknownModality { .. }
-        | ReconstructorError::Clip { .. }
-        | ReconstructorError::Tokenizer(_) => "use clips of the form the model was trained on",
     };
     StageError::Input {
         code: Code::E0601,

@@ -3,7 +3,6 @@
 //! The artifact holds one folder, `reconstruction`, as [`crate::reconstruction::folder`] writes it: arrays, exports, manifest
 //! and page.
 
-mod recording;
 mod run;
 
 use super::predict::{artifact, takes_pixels};

@@ -5,9 +5,10 @@
 //! used on its own. A clip without a modality, or with all of it invalid, has no member in that modality's shards. A shard
 //! that is complete survives an interruption.
 
-use super::clip_signals::{SPLITS, damaged, extract, format, modality, open_split};
+use super::clip_signals::{SPLITS, damaged, format, modality, open_split};
 use crate::clip::shard::{ShardError, ShardWriter, TOKENS_PER_SHARD};
 use crate::clip::store::{ClipSet, tokens_to_bytes};
+use crate::engine::Compute;
 use crate::experiment::{
     Arity, ArtifactKind, Code, Description, Inputs, Op, OpEntry, Port, Problem, StageContext,
     StageError, StagePlan, TokenFacts, TokenPlan,
@@ -16,6 +17,7 @@ use crate::formats::npz::Npz;
 use crate::masking::PIXELS;
 use crate::modality::Modality;
 use crate::tokenizer::{self, Tokenizer};
+use crate::training::signals::extract;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
@@ -219,8 +221,8 @@ impl Op for Tokenize {
         let mut writers = Vec::new();
         let mut tokens = BTreeMap::new();
         for artifact in context.inputs("tokenizers").to_vec() {
-            let tokenizer =
-                tokenizer::open(&artifact.path).map_err(|error| damaged(&error.to_string()))?;
+            let tokenizer = tokenizer::open(&artifact.path, &Compute::cpu())
+                .map_err(|error| damaged(&error.to_string()))?;
             let name = tokenizer.modality().to_owned();
             if !settings.takes(&name) {
                 continue;
@@ -303,7 +305,8 @@ impl Writer {
         range: std::ops::Range<usize>,
         shard: &mut ShardWriter,
     ) -> Result<(), StageError> {
-        let found = extract(set, self.modality.as_ref(), &[], range)?;
+        let found = extract(set, self.modality.as_ref(), &[], range)
+            .map_err(|error| damaged(&error.to_string()))?;
         let (clips, signals): (Vec<_>, Vec<_>) = found
             .into_iter()
             .map(|found| (found.clip.id, found.signal))

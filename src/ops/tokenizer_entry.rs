@@ -1,27 +1,8 @@
 //! What `registry/tokenizer/*.yaml` hold: the settings of one family of tokenizers.
 
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
-
 use crate::experiment::{Kind, KindEntry};
-use crate::tokenizer::video::VideoSettings;
-use crate::tokenizer::vq::VqSettings;
 
-/// A tokenizer before it is trained, by family.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(tag = "family", rename_all = "snake_case")]
-pub enum TokenizerEntry {
-    /// VQ-VAE of signals or joints over time.
-    Vq(VqSettings),
-    /// Wavelet, causal convolutions and finite scalar quantisation of video (Cosmos).
-    Video(VideoSettings),
-}
-
-impl Default for TokenizerEntry {
-    fn default() -> Self {
-        Self::Vq(VqSettings::default())
-    }
-}
+pub use crate::tokenizer::TokenizerSettings as TokenizerEntry;
 
 impl Kind for TokenizerEntry {
     const KIND: &'static str = "tokenizer";
@@ -88,6 +69,25 @@ mod tests {
             };
             settings.check().unwrap();
             assert_eq!(settings.vocabulary(), vocabulary, "{name}");
+        }
+    }
+
+    #[test]
+    fn the_library_s_small_tokenizers_are_those_of_the_registry() {
+        use crate::tokenizer::video::VideoSettings;
+        use crate::tokenizer::vq::VqSettings;
+        for (name, settings) in [
+            ("video_tiny", TokenizerEntry::Video(VideoSettings::tiny())),
+            (
+                "vq_temporal_small",
+                TokenizerEntry::Vq(VqSettings::temporal_small()),
+            ),
+            (
+                "vq_kinematic_small",
+                TokenizerEntry::Vq(VqSettings::kinematic_small()),
+            ),
+        ] {
+            assert_eq!(entry(name), settings, "{name}");
         }
     }
 

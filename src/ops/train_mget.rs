@@ -293,7 +293,7 @@ impl Op for TrainMget {
         context: &mut dyn StageContext,
     ) -> Result<Value, StageError> {
         let _memory = crate::engine::memory::Stage;
-        run::Run::prepare(settings, context)?.train(context)
+        run::run(settings, context)
     }
 }
 

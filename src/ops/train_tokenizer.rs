@@ -4,11 +4,9 @@
 //! from the training split, scores from the validation split. A hand's tokenizer also trains on the other hand in a mirror.
 //! Writes `tokenizer.safetensors`, `scores.json`, `report/tokenizer.md` and a picture.
 
-mod errors;
 mod picture;
 mod report;
 mod run;
-mod scores;
 
 use super::clip_signals::{described_format, modality, unknown_modality};
 use super::modality_entry::{DEFAULTS, read_defaults};
@@ -117,11 +115,6 @@ impl TrainTokenizerSettings {
             }
             Duration::Epochs(_) | Duration::Tokens(_) => None,
         }
-    }
-
-    /// Whether held-out losses are computed while it trains.
-    fn validates(&self) -> bool {
-        self.validate_every > 0 || self.keep == Keep::Best
     }
 
     /// The tokenizer that is named here, or else by the entry of the modality, as a clips artifact passes it on.

@@ -8,9 +8,11 @@ use serde::{Deserialize, Serialize};
 /// How a window's depth was brought to the scale of the one before it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct DepthSeam {
+    /// The later window.
     pub window: usize,
     /// `previous = scale * this + shift`.
     pub scale: f64,
+    /// In units of the depth.
     pub shift: f64,
     /// Root mean square difference after the fit, in units of the depth.
     pub residual: f64,

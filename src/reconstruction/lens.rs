@@ -35,12 +35,15 @@ impl Default for LensSettings {
 pub struct Calibration {
     /// Focal lengths.
     pub fx: f64,
+    /// Vertical focal length.
     pub fy: f64,
     /// Principal point.
     pub cx: f64,
+    /// Row of the principal point.
     pub cy: f64,
     /// Size of the picture these numbers are for; another size with the same shape is scaled.
     pub width: u32,
+    /// Height of that picture.
     pub height: u32,
 }
 

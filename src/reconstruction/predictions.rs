@@ -38,6 +38,7 @@ pub struct PredictionsIndex {
     pub system: String,
     /// By modality name.
     pub signals: BTreeMap<String, SignalNote>,
+    /// Every clip, in order.
     pub clips: Vec<PredictedClip>,
 }
 
@@ -50,6 +51,7 @@ pub struct SignalNote {
     pub frame: String,
     /// Hz.
     pub rate: f64,
+    /// Whether the numbers are metric, and by what.
     pub scale: ScaleStatus,
 }
 
@@ -84,6 +86,7 @@ impl ScaleStatus {
 pub struct PredictedClip {
     /// The id of the clip that was predicted.
     pub id: String,
+    /// The data set of the clip.
     pub source: String,
     /// Relative to the folder.
     pub file: String,
@@ -194,6 +197,7 @@ impl PredictionsWriter {
 #[derive(Debug, Clone)]
 pub struct Predictions {
     directory: PathBuf,
+    /// What the folder says of itself.
     pub index: PredictionsIndex,
 }
 

@@ -85,7 +85,9 @@ impl DepthRay {
 /// `metric = scale * depth + shift`, and how good that is.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct DepthFit {
+    /// Above 0.
     pub scale: f64,
+    /// Metres.
     pub shift: f64,
     /// Root mean square residual over the fitted points: heights for the floor, depths for an anchor, metres.
     pub residual: f64,
@@ -93,6 +95,17 @@ pub struct DepthFit {
     pub points: usize,
     /// Share of fitted points beyond [`FloorFit::outlier`]; 0 for an anchor.
     pub outliers: f64,
+}
+
+/// Depth is never nearer than this, metres.
+pub(super) const NEAREST: f32 = 0.01;
+
+impl DepthFit {
+    /// A depth in metres.
+    #[must_use]
+    pub fn apply(&self, depth: f32) -> f32 {
+        (self.scale as f32 * depth + self.shift as f32).max(NEAREST)
+    }
 }
 
 /// Why no metric scale was found. The depth then stays relative.

@@ -13,6 +13,7 @@ const GRID: usize = 15;
 /// One window, in motion samples from the start of the video.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Window {
+    /// Which window, from 0.
     pub index: usize,
     /// First sample.
     pub start: usize,

@@ -14,8 +14,8 @@ use super::stage::{self, Surroundings};
 use super::worker_pool::{Ended, WorkerPool};
 use super::{gc, provenance, report};
 use crate::experiment::Experiment;
-use std::collections::BTreeSet;
-use std::path::Path;
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 /// What to run, and how.
@@ -43,6 +43,17 @@ pub struct Outcome {
     pub found: usize,
     /// Every stage that failed, in order; what depends on it was left out, everything else was done.
     pub failures: Vec<RunError>,
+    /// Where the artifact of each stage is, of those that are made; of a sweep, that of the last arm.
+    pub artifacts: BTreeMap<String, PathBuf>,
+}
+
+/// Where the artifacts that are made lie, by stage.
+fn artifacts(schedule: &Schedule, cache: &Cache) -> BTreeMap<String, PathBuf> {
+    let works = schedule.works.iter();
+    works
+        .filter(|work| cache.contains(&work.key))
+        .map(|work| (work.stage.clone(), cache.path(&work.key)))
+        .collect()
 }
 
 /// Where the cache of a directory of runs is.
@@ -76,6 +87,7 @@ pub fn execute(job: &Job<'_>) -> Result<Outcome, RunError> {
             made: 0,
             found,
             failures: Vec::new(),
+            artifacts: artifacts(&schedule, &cache),
         });
     }
 
@@ -119,6 +131,7 @@ pub fn execute(job: &Job<'_>) -> Result<Outcome, RunError> {
         made,
         found: found.saturating_sub(made),
         failures,
+        artifacts: artifacts(&schedule, &cache),
     })
 }
 

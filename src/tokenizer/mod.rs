@@ -1,5 +1,6 @@
 //! Tokenizers: every modality becomes a grid of discrete tokens and back (Sec. 4.2, Supp. A).
 
+pub mod family;
 pub mod normaliser;
 pub mod open;
 pub mod patches;
@@ -9,9 +10,11 @@ pub mod video;
 pub mod vq;
 pub mod whitening;
 
+pub use family::TokenizerSettings;
 pub use open::open;
 
 use crate::clip::Signal;
+use std::path::Path;
 
 /// The tokens of one clip and modality.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -40,6 +43,11 @@ pub trait Tokenizer: Send + Sync {
     /// # Errors
     /// When a grid has another shape, or a token is outside the vocabulary.
     fn decode(&self, tokens: &[TokenGrid]) -> Result<Vec<Signal>, TokenizerError>;
+    /// Writes the tokenizer into `directory`, for [`open()`]; equal tokenizers give equal bytes.
+    ///
+    /// # Errors
+    /// When a file cannot be written.
+    fn write(&self, directory: &Path) -> Result<(), TokenizerError>;
 }
 
 /// Checks token grids before `tokenizer` decodes them.

@@ -94,11 +94,13 @@ impl Normaliser {
         self.mean.len()
     }
 
+    /// One mean per value of a sample.
     #[must_use]
     pub fn mean(&self) -> &[f32] {
         &self.mean
     }
 
+    /// One standard deviation per value of a sample.
     #[must_use]
     pub fn deviation(&self) -> &[f32] {
         &self.deviation

@@ -8,12 +8,11 @@ use super::video::stored;
 use super::{Tokenizer, TokenizerError};
 use crate::engine::{Compute, Weights};
 
-/// The tokenizer in `directory`, of whichever family, on the CPU.
+/// The tokenizer in `directory`, of whichever family, on a device.
 ///
 /// # Errors
 /// When there is no `tokenizer.safetensors`, or it is damaged or of an unknown format.
-pub fn open(directory: &Path) -> Result<Box<dyn Tokenizer>, TokenizerError> {
-    let compute = &Compute::cpu();
+pub fn open(directory: &Path, compute: &Compute) -> Result<Box<dyn Tokenizer>, TokenizerError> {
     let path = directory.join(trained::FILE);
     let weights = Weights::read(&path).map_err(|error| TokenizerError::Other(error.to_string()))?;
     let format = weights.metadata.get("format").map(String::as_str);
@@ -30,12 +29,18 @@ mod tests {
     #[test]
     fn what_is_no_tokenizer_is_refused_with_the_file() {
         let folder = tempfile::tempdir().unwrap();
-        let missing = open(folder.path()).err().unwrap().to_string();
+        let missing = open(folder.path(), &Compute::cpu())
+            .err()
+            .unwrap()
+            .to_string();
         assert!(missing.contains("tokenizer.safetensors"), "{missing}");
         Weights::default()
             .write(&folder.path().join(trained::FILE))
             .unwrap();
-        let unknown = open(folder.path()).err().unwrap().to_string();
+        let unknown = open(folder.path(), &Compute::cpu())
+            .err()
+            .unwrap()
+            .to_string();
         assert!(unknown.contains("format"), "{unknown}");
     }
 }

@@ -97,11 +97,13 @@ impl Patches {
         self.channels * self.patch[0] * self.patch[1]
     }
 
+    /// Values of a sample or joint.
     #[must_use]
     pub fn channels(&self) -> usize {
         self.channels
     }
 
+    /// Whether the signal is joints over time.
     #[must_use]
     pub fn is_kinematic(&self) -> bool {
         self.kinematic

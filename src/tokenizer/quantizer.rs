@@ -111,6 +111,7 @@ impl Quantizer {
         }
     }
 
+    /// What it was made with.
     #[must_use]
     pub fn settings(&self) -> &QuantizerSettings {
         &self.settings

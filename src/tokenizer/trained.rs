@@ -25,11 +25,13 @@ const BATCH: usize = 16;
 
 /// The names of the statistics beside the weights.
 pub const MEAN: &str = "normalise.mean";
+/// The name of the deviations.
 pub const DEVIATION: &str = "normalise.deviation";
 
 /// A normalised signal, row-major: what a model trains on.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Prepared {
+    /// As many as the signal has; 0 where invalid.
     pub values: Vec<f32>,
     /// One flag per sample or joint; `None`: all valid.
     pub valid: Option<Vec<bool>>,
@@ -72,16 +74,19 @@ impl VqTokenizer {
         })
     }
 
+    /// The network with its codebook.
     #[must_use]
     pub fn model(&self) -> &VqVae {
         &self.model
     }
 
+    /// The statistics it was trained with.
     #[must_use]
     pub fn normaliser(&self) -> &Normaliser {
         &self.normaliser
     }
 
+    /// The shape of its signals.
     #[must_use]
     pub fn shape(&self) -> &Shape {
         &self.shape
@@ -179,16 +184,6 @@ impl VqTokenizer {
         let mut model = VqVae::new(&Initialise::empty(compute), &settings, &shape)?;
         model.load(&weights).map_err(unfit)?;
         Self::new(&modality, shape, normaliser, &model)
-    }
-
-    /// Writes `tokenizer.safetensors` into `directory`; equal tokenizers give equal bytes.
-    ///
-    /// # Errors
-    /// When the file cannot be written.
-    pub fn write(&self, directory: &Path) -> Result<(), TokenizerError> {
-        self.weights()
-            .write(&directory.join(FILE))
-            .map_err(|error| TokenizerError::Other(error.to_string()))
     }
 
     /// Reads the tokenizer in `directory`, which must be one of `modality`.
@@ -308,6 +303,12 @@ pub fn prepare(
 }
 
 impl Tokenizer for VqTokenizer {
+    fn write(&self, directory: &Path) -> Result<(), TokenizerError> {
+        self.weights()
+            .write(&directory.join(FILE))
+            .map_err(|error| TokenizerError::Other(error.to_string()))
+    }
+
     fn modality(&self) -> &str {
         &self.modality
     }

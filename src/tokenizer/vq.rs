@@ -169,6 +169,7 @@ pub struct Trained {
     pub loss: Tensor<1>,
     /// The two parts.
     pub reconstruction: f64,
+    /// How far latents are from their codes: mean squared difference.
     pub commitment: f64,
     /// For the codebook's update.
     pub assignment: Assignment,
@@ -207,21 +208,25 @@ impl VqVae {
         })
     }
 
+    /// How signals are cut into tokens.
     #[must_use]
     pub fn patches(&self) -> &Patches {
         &self.patches
     }
 
+    /// What it was made with.
     #[must_use]
     pub fn settings(&self) -> &VqSettings {
         &self.settings
     }
 
+    /// The codebook.
     #[must_use]
     pub fn quantizer(&self) -> &Quantizer {
         &self.quantize
     }
 
+    /// The codebook, to be moved.
     pub fn quantizer_mut(&mut self) -> &mut Quantizer {
         &mut self.quantize
     }

@@ -2,7 +2,8 @@
 //!
 //! Read in this order: [`settings`], [`source`] (where tokens come from), [`sampler`] (which clip stands where), [`loader`]
 //! (batches prepared ahead), [`trainer`] (**one step, and the state between steps**), [`mod@fit`] (the loop), [`validation`],
-//! [`optimizer`], [`schedule`]. Trained are [`mget`] and [`tokenizer`]s; [`kmeans`] is what the latter have to beat.
+//! [`optimizer`], [`schedule`]. Trained are [`mget`] and [`tokenizer`]s; [`kmeans`] is what the latter have to beat. [`mget_fit`] and
+//! [`tokenizer_fit`] are the way from clips to a model.
 //!
 //! Data order, masks and initial weights are functions of the seed and the step, so a run that was killed and resumed has the
 //! same bytes as one that was not.
@@ -11,25 +12,33 @@ pub mod fit;
 pub mod kmeans;
 pub mod loader;
 pub mod mget;
+pub mod mget_fit;
 pub mod optimizer;
 pub mod sampler;
 pub mod schedule;
 pub mod settings;
 pub mod shards;
+pub mod signals;
 pub mod source;
 pub mod tokenizer;
+mod tokenizer_errors;
+pub mod tokenizer_fit;
+pub mod tokenizer_scores;
 pub mod trainer;
 pub mod validation;
 pub mod video_kmeans;
 
-pub use fit::{Event, Fitted, Flow, Intervals, fit};
+pub use crate::flow::Flow;
+pub use fit::{Callback, Checkpoint, Event, Intervals, fit};
 pub use loader::{BatchSource, Loader};
 pub use mget::MaskedPrediction;
+pub use mget_fit::{FittedMget, MgetFit, TrainOptions};
 pub use optimizer::{AdamW, AdamWSettings};
 pub use sampler::Sampler;
 pub use schedule::Schedule;
 pub use settings::{DatasetSize, Duration, Keep, TrainingSettings};
 pub use shards::Shards;
 pub use source::{DataError, InMemory, TokenSample, TokenSource};
+pub use tokenizer_fit::{FittedTokenizer, TokenizerFit, TokenizerOptions};
 pub use trainer::{HeldOut, Objective, Progress, StepReport, Trainer, TrainingError};
 pub use validation::{Score, Unigram, Validation};

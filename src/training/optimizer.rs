@@ -87,6 +87,7 @@ pub struct AdamW {
 pub struct NotFinite {
     /// Counted from 1.
     pub step: u64,
+    /// Global norm of the gradient.
     pub norm: f64,
 }
 

@@ -33,8 +33,11 @@ pub struct Schedule {
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{warmup} warm-up and {cooldown} cool-down steps do not fit into a run of {total} steps")]
 pub struct ScheduleError {
+    /// Warm-up steps.
     pub warmup: u64,
+    /// Cool-down steps.
     pub cooldown: u64,
+    /// Steps of the whole run.
     pub total: u64,
 }
 

@@ -348,11 +348,11 @@ pub fn mirrored(signal: &Signal) -> Result<Signal, ndarray::ShapeError> {
 mod tests {
     use super::*;
     use crate::engine::{Compute, Initialise};
+    use crate::flow::Flow;
     use crate::tokenizer::video::testing::small;
     use crate::tokenizer::vq::VqSettings;
-    use crate::training::fit::{Event, Flow, Intervals, fit};
+    use crate::training::fit::{Event, Intervals, fit};
     use ndarray::{ArrayD, IxDyn};
-    use std::path::Path;
 
     const SHAPE: crate::modality::Shape = crate::modality::Shape::Temporal {
         samples: 8,
@@ -520,7 +520,7 @@ mod tests {
             keep,
             ..settings(9, 0)
         };
-        let run = |trainer: &mut Trainer<VqReconstruction>, cut: Option<u64>, kept: &Path| {
+        let run = |trainer: &mut Trainer<VqReconstruction>, cut: Option<u64>| {
             let mut epochs = Epochs::of(trainer, 4);
             let mut step = trainer.progress().step;
             fit(
@@ -539,24 +539,23 @@ mod tests {
                     let score = Score { loss, tokens: 1 };
                     Ok(BTreeMap::from([("x".to_owned(), score)]))
                 },
-                |event| match event {
+                &mut |event| match event {
                     Event::Step { report, .. } if Some(report.step) == cut => Ok(Flow::Stop),
-                    Event::Checkpoint(trainer) => trainer.save(kept).map(|()| Flow::Continue),
+                    Event::Checkpoint(state) => state.save(kept.path()).map(|()| Flow::Continue),
                     _ => Ok(Flow::Continue),
                 },
             )
-            .unwrap()
         };
         let mut trainer = trainer(&settings);
-        let mut done = run(&mut trainer, cut, kept.path());
+        let mut done = run(&mut trainer, cut);
         if let Some(cut) = cut {
-            assert_eq!((done.flow, done.held_out.step), (Flow::Stop, cut));
+            assert!(matches!(done, Err(TrainingError::Stopped)));
             trainer = self::trainer(&settings);
             trainer.resume(kept.path()).unwrap();
-            done = run(&mut trainer, None, kept.path());
+            assert_eq!(trainer.progress().step, cut);
+            done = run(&mut trainer, None);
         }
-        assert_eq!(done.flow, Flow::Continue);
-        (done.held_out.step, trainer.model().weights())
+        (done.unwrap().step, trainer.model().weights())
     }
 
     #[test]

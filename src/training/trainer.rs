@@ -5,11 +5,14 @@
 
 use super::optimizer::{AdamW, AdamWSettings, NotFinite};
 use super::schedule::{Schedule, ScheduleError};
-use super::settings::Keep;
+use super::settings::{Keep, SettingsError};
 use super::source::DataError;
 use super::validation::Score;
 use crate::engine::{EngineError, Gradients, Parameters, Weights};
 use crate::formats::ReadError;
+use crate::masking::MaskingError;
+use crate::mget::SpecError;
+use crate::model::ModelError;
 use crate::tokenizer::TokenizerError;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -103,6 +106,8 @@ pub struct StepReport {
     pub gradient_norm: f64,
     /// Totals so far.
     pub progress: Progress,
+    /// Seconds that steps have waited for data so far.
+    pub waited: f64,
 }
 
 impl StepReport {
@@ -126,9 +131,19 @@ pub struct HeldOut {
     pub step: u64,
     /// By modality.
     pub scores: BTreeMap<String, Score>,
+    /// What token frequencies alone give, where that was computed.
+    pub baseline: BTreeMap<String, Score>,
 }
 
 impl HeldOut {
+    /// The loss that token frequencies alone give; NaN where it is not known.
+    #[must_use]
+    pub fn baseline_of(&self, modality: &str) -> f64 {
+        self.baseline
+            .get(modality)
+            .map_or(f64::NAN, |score| score.loss)
+    }
+
     /// The mean over modalities; `None` where nothing was held out.
     #[must_use]
     pub fn mean(&self) -> Option<f64> {
@@ -154,6 +169,20 @@ pub enum TrainingError {
     Gradient(#[from] NotFinite),
     #[error("there is nothing to train on")]
     NoData,
+    #[error("stopped by its callback")]
+    Stopped,
+    #[error("the clips have no modality `{0}`")]
+    UnknownModality(String),
+    #[error("clip `{clip}`: {reason}")]
+    Clip { clip: String, reason: String },
+    #[error(transparent)]
+    Settings(#[from] SettingsError),
+    #[error(transparent)]
+    Spec(#[from] SpecError),
+    #[error(transparent)]
+    Masking(#[from] MaskingError),
+    #[error(transparent)]
+    Model(#[from] ModelError),
     #[error(transparent)]
     Data(#[from] DataError),
     #[error(transparent)]
@@ -254,6 +283,7 @@ impl<O: Objective> Trainer<O> {
             learning_rate,
             gradient_norm,
             progress,
+            waited: 0.0,
         })
     }
 

@@ -3,7 +3,9 @@
 /// A point in the world, metres, and its sRGB colour.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Point {
+    /// Metres, in the world.
     pub position: [f32; 3],
+    /// Red, green, blue.
     pub color: [u8; 3],
 }
 

@@ -155,6 +155,23 @@ impl World {
         Self { settings, seed }
     }
 
+    /// The world of 64 x 64 pixels and 48 rooms, under seed 0: for CPU training in minutes.
+    #[must_use]
+    pub fn small() -> Self {
+        let settings = WorldSettings {
+            size: 64,
+            rooms: Some(48),
+            ..WorldSettings::default()
+        };
+        Self::new(settings, 0)
+    }
+
+    /// A stretch of its clips, as a source like any other.
+    #[must_use]
+    pub fn clips(&self, range: std::ops::Range<u64>) -> WorldClips {
+        WorldClips::new(self.clone(), range)
+    }
+
     /// The settings.
     pub fn settings(&self) -> &WorldSettings {
         &self.settings

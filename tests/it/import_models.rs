@@ -4,11 +4,11 @@ use crate::parity::check_parity;
 use crate::released::{self, Small};
 use crate::shared;
 use reviv::decoding::DecodingSettings;
-use reviv::decoding::reconstructor::{GenerationRequest, Reconstructor};
 use reviv::engine::{Compute, Parameters, Weights};
 use reviv::import::{ImportOptions, import};
 use reviv::mget::names::to_release;
 use reviv::mget::{Mget, Size};
+use reviv::model::{GenerationRequest, Model};
 use reviv::tokenizer::trained::VqTokenizer;
 use reviv::tokenizer::{self, Tokenizer};
 use reviv::world::{World, WorldSettings};
@@ -109,7 +109,7 @@ fn imported_signal_tokenizers_reproduce_every_number_of_the_reference() {
         };
         import(&files, &folder, &options).unwrap();
         let path = folder.join("tokenizers").join(modality);
-        let opened = tokenizer::open(&path).unwrap();
+        let opened = tokenizer::open(&path, &Compute::cpu()).unwrap();
         assert_eq!((opened.modality(), opened.vocabulary()), (modality, 64));
 
         // Through the public door: a clip to the reference's tokens, and these to its clip.
@@ -202,12 +202,12 @@ fn an_imported_video_tokenizer_reproduces_every_number_of_the_reference() {
         let file = vectors.join(format!("cosmos/{stem}_model.safetensors"));
         let folder = temporary.path().join(stem);
         import(&[file], &folder, &ImportOptions::default()).unwrap();
-        let opened = tokenizer::open(&folder.join("tokenizers/rgb")).unwrap();
+        let opened = tokenizer::open(&folder.join("tokenizers/rgb"), &Compute::cpu()).unwrap();
         assert_eq!(
             (opened.grid(), opened.vocabulary()),
             (&[5, 32, 32][..], 64_000)
         );
-        let depth = tokenizer::open(&folder.join("tokenizers/depth")).unwrap();
+        let depth = tokenizer::open(&folder.join("tokenizers/depth"), &Compute::cpu()).unwrap();
         assert_eq!(depth.modality(), "depth");
         let path = folder.join("tokenizers/rgb/tokenizer.safetensors");
         let mut weights = Weights::read(&path).unwrap();
@@ -263,7 +263,7 @@ fn an_imported_set_decodes_a_clip_end_to_end() {
         ..WorldSettings::default()
     };
     let world = World::new(settings, 7);
-    let model = Reconstructor::open(&folder, &Compute::cpu()).unwrap();
+    let model = Model::open(&folder, &Compute::cpu()).unwrap();
     assert_eq!(*model.format(), world.settings().format());
     let inputs = ["rgb".to_owned()];
     let targets = ["body", "camera", "depth", "gaze", "left_hand", "right_hand"].map(str::to_owned);
@@ -274,7 +274,7 @@ fn an_imported_set_decodes_a_clip_end_to_end() {
         seed: 0,
     };
     let clips = [world.clip(0), world.clip(1)];
-    let made = model.reconstruct(&clips, &[0, 1], &request).unwrap();
+    let made = model.predict(&clips, &[0, 1], &request).unwrap();
     for one in &made {
         let clip = &one.clip;
         assert!(clip.camera().is_some() && clip.depth().is_some() && clip.gaze().is_some());
@@ -289,7 +289,7 @@ fn an_imported_set_decodes_a_clip_end_to_end() {
         other,
     )
     .unwrap();
-    let error = Reconstructor::open(&folder, &Compute::cpu()).err().unwrap();
+    let error = Model::open(&folder, &Compute::cpu()).err().unwrap();
     assert!(error.to_string().contains("left_hand"), "{error}");
 }
 
@@ -325,7 +325,7 @@ fn statistics_and_weights_are_one_file_that_names_both() {
     let files = [released.join("reviv_tok_cam.pth")];
     let report = import(&files, &folder, &ImportOptions::default()).unwrap();
     assert!(report.notices[0].contains("no statistics for `camera`"));
-    let error = tokenizer::open(&folder.join("tokenizers/camera"))
+    let error = tokenizer::open(&folder.join("tokenizers/camera"), &Compute::cpu())
         .err()
         .unwrap();
     assert!(error.to_string().contains("norm_stats"), "{error}");

@@ -8,6 +8,7 @@ mod data;
 mod diagnostics;
 mod egom2p_examples;
 mod evaluation;
+mod examples;
 mod full_disk;
 mod metrics;
 mod modality_plugin;

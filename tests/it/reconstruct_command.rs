@@ -2,11 +2,11 @@
 //! the same request gives the same bytes.
 
 use assert_cmd::Command;
-use reviv::decoding::reconstructor::{ModelManifest, TOKENIZERS};
 use reviv::engine::{Compute, Initialise};
 use reviv::masking::PIXELS;
 use reviv::mget::{Mget, MgetSpec, ModalitySpec, Positions, Size};
 use reviv::modality::{self, ClipFormat, Shape};
+use reviv::model::{ModelManifest, TOKENIZERS};
 use reviv::tokenizer::Tokenizer;
 use reviv::tokenizer::normaliser::Normaliser;
 use reviv::tokenizer::trained::VqTokenizer;

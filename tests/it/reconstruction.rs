@@ -9,8 +9,10 @@ use reviv::formats::npz::Npz;
 use reviv::geometry::rigid::Rigid;
 use reviv::geometry::rigid::level_camera;
 use reviv::geometry::skeleton::{BODY, JOINTS};
+use reviv::reconstruction::ReconstructionInfo;
 use reviv::reconstruction::cloud::ray;
-use reviv::reconstruction::folder::{Folder, ReconstructionInfo, first_camera};
+use reviv::reconstruction::folder::{Builder, first_camera};
+use reviv::reconstruction::frame_buffer::DepthFrames;
 use reviv::reconstruction::predictions::ScaleStatus;
 use reviv::reconstruction::scale::FloorFit;
 use reviv::reconstruction::stitch::gravity_to_world;
@@ -138,7 +140,8 @@ fn build(
     setting: ReconstructionInfo,
     path: &std::path::Path,
 ) -> reviv::reconstruction::folder::Manifest {
-    let mut folder = Folder::new(path, setting).unwrap();
+    let depth = DepthFrames::on_disk(path.parent().unwrap()).unwrap();
+    let mut builder = Builder::new(setting, depth);
     for window in windows(seconds, 0.5).unwrap() {
         let rgb = Array4::from_shape_fn((16, 32, 32, 3), |(f, y, x, c)| {
             (f * 9 + y * 5 + x * 3 + c * 50) as u8
@@ -146,7 +149,7 @@ fn build(
         // Every window has a scale of its own, as relative depth has.
         let wrong = [2.0 + window.index as f64, 0.1 * window.index as f64];
         let confidence = BTreeMap::from([("body".to_owned(), vec![0.5; 60])]);
-        folder
+        builder
             .push(
                 &window,
                 rgb.view(),
@@ -155,7 +158,7 @@ fn build(
             )
             .unwrap();
     }
-    folder.finish().unwrap()
+    builder.finish().unwrap().write(path).unwrap()
 }
 
 #[test]

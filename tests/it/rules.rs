@@ -14,11 +14,12 @@ const FLOORS: &[&[&str]] = &[
         "evaluation",
         "view",
         "import",
+        "model",
     ],
     &["tokenizer", "mget", "masking", "labelling"],
     &["datasets", "world"],
     &["modality", "clip", "video"],
-    &["nn", "engine", "geometry", "formats", "random"],
+    &["nn", "engine", "geometry", "formats", "random", "flow"],
 ];
 
 /// The framework knows no model: beside itself it may use nothing but these.

@@ -141,7 +141,7 @@ fn clips_become_tokens_that_the_model_reads_and_the_tokenizer_decodes() {
     let shards = Shards::open(&tokens.join("validation"), "tiny", &spec).unwrap();
     let grid = shards.read(0).unwrap().tokens["camera"].clone();
     for place in [path.clone(), tokens.join("tokenizers/camera")] {
-        let tokenizer = reviv::tokenizer::open(&place).unwrap();
+        let tokenizer = reviv::tokenizer::open(&place, &reviv::engine::Compute::cpu()).unwrap();
         let signals = tokenizer.decode(std::slice::from_ref(&grid)).unwrap();
         assert_eq!(signals[0].values.shape(), [60, 9]);
     }

@@ -1,50 +1,63 @@
-//! The loop: window by window from frames to the folder.
+//! Running `op: reconstruct`: the recording, one call, and where the time went.
 
 use super::ReconstructSettings;
-use super::recording::{Recording, input};
-use crate::clip::{Clip, RGB};
-use crate::decoding::{GenerationRequest, Reconstructor};
+use crate::clip::store::ClipSet;
 use crate::engine::Compute;
-use crate::experiment::{StageContext, StageError};
-use crate::labelling::DepthLabeller;
-use crate::masking::PIXELS;
+use crate::experiment::{Code, StageContext, StageError};
+use crate::flow::Flow;
+use crate::modality::ClipFormat;
+use crate::model::Model;
 use crate::ops::predict::refused;
-use crate::reconstruction::anchor;
-use crate::reconstruction::folder::{FOLDER, Folder, ReconstructionInfo};
-use crate::reconstruction::windows::{samples_of, windows};
+use crate::reconstruction::folder::FOLDER;
+use crate::reconstruction::frame_buffer::DepthFrames;
+use crate::reconstruction::{
+    Anchor, Part, ReconstructError, ReconstructOptions, Recording, reconstruct_recording,
+};
 use crate::run::environment::Stopwatch;
-use crate::view::Fact;
+use crate::video::Video;
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
-use std::fmt::Write as _;
+use std::fmt::{Display, Write as _};
 use std::path::Path;
 
 /// Seconds by part of the work.
-#[derive(Debug, Default)]
-struct Times(BTreeMap<&'static str, f64>);
+#[derive(Debug)]
+struct Times {
+    watch: Stopwatch,
+    since: f64,
+    parts: BTreeMap<&'static str, f64>,
+}
 
 impl Times {
-    fn take<T>(&mut self, part: &'static str, work: impl FnOnce() -> T) -> T {
-        let watch = Stopwatch::start();
-        let made = work();
-        *self.0.entry(part).or_default() += watch.seconds();
-        made
+    fn start() -> Self {
+        Self {
+            watch: Stopwatch::start(),
+            since: 0.0,
+            parts: BTreeMap::new(),
+        }
+    }
+
+    /// The time since the last call was that of `part`.
+    fn lap(&mut self, part: &'static str) {
+        let now = self.watch.seconds();
+        *self.parts.entry(part).or_default() += now - self.since;
+        self.since = now;
     }
 
     fn record(&self, context: &mut dyn StageContext, windows: usize) -> Result<(), StageError> {
         let names: Vec<String> = self
-            .0
+            .parts
             .keys()
             .map(|part| format!("seconds/{part}"))
             .collect();
         let scalars: Vec<(&str, f64)> = names
             .iter()
             .map(String::as_str)
-            .zip(self.0.values().copied())
+            .zip(self.parts.values().copied())
             .collect();
         context.record(windows as u64, &scalars)?;
         let mut text = String::from("| part | seconds | per window |\n|---|---|---|\n");
-        for (part, seconds) in &self.0 {
+        for (part, seconds) in &self.parts {
             let each = seconds / windows.max(1) as f64;
             let _ = writeln!(text, "| {part} | {seconds:.2} | {each:.3} |");
         }
@@ -57,131 +70,114 @@ pub(super) fn run(
     model: &Path,
     context: &mut dyn StageContext,
 ) -> Result<Value, StageError> {
-    let mut times = Times::default();
-    let reconstructor = times
-        .take("open the model", || {
-            Reconstructor::open(model, &Compute::cpu())
-        })
-        .map_err(refused)?;
-    let format = reconstructor.format().clone();
-    let targets: Vec<String> = if settings.targets.is_empty() {
-        let others = reconstructor.names().filter(|name| *name != "rgb");
-        others.map(ToOwned::to_owned).collect()
-    } else {
-        settings.targets.clone()
-    };
-    let inputs = if settings.inputs.is_empty() {
-        let tokens = reconstructor.names().any(|name| name == "rgb");
-        vec![if tokens { "rgb" } else { PIXELS }.to_owned()]
-    } else {
-        settings.inputs.clone()
-    };
-    let clips = context.inputs("clips").first().cloned();
-    let recording = Recording::open(settings, clips.as_ref(), &format)?;
-    let list = windows(recording.seconds, settings.overlap)
-        .map_err(|error| input(error, "choose another `overlap`"))?;
-    let has = |name: &str| targets.iter().any(|target| target == name);
-    if list.len() > 1 && has("body") && !has("camera") {
-        return Err(input(
-            "`body` over several windows needs the camera path, which says where each window starts",
-            "add `camera` to `targets`",
-        ));
-    }
-    let samples = samples_of(recording.seconds);
-    let rate = format.video_rate;
-    let frames = ((recording.seconds * rate - 1e-6).ceil() as usize).max(1);
-    let mut assumptions = recording.assumptions.clone();
-    assumptions.push(Fact {
-        label: "Decoding".into(),
-        value: format!(
-            "`{}`, seed {}, windows of 2 s ({}), {} s in common",
-            settings.decoding.name,
-            context.seed(),
-            list.len(),
-            settings.overlap
-        ),
-    });
-    let anchor = match (&settings.anchor, &settings.anchor_model) {
-        (Some(path), _) => Some(
-            anchor::read(path.as_ref(), frames)
-                .map_err(|error| input(error, "see `anchor` in `reviv show reconstruct`"))?,
-        ),
-        (None, Some(folder)) => {
-            let help = "`reviv import FILE --depth metric -o DIR` makes the folder";
-            let network = DepthLabeller::open(folder.as_ref(), &Compute::cpu())
-                .map_err(|error| input(error, help))?;
-            assumptions.push(Fact {
-                label: "Anchor".into(),
-                value: format!(
-                    "metric depth by Video Depth Anything {} ({})",
-                    network
-                        .network()
-                        .settings()
-                        .name()
-                        .unwrap_or("of other sizes"),
-                    folder.0
-                ),
-            });
-            let maps = times.take("label the anchor", || {
-                recording.anchor(&network, rate, frames)
-            })?;
-            Some(maps)
+    let mut times = Times::start();
+    let model = Model::open(model, &Compute::cpu()).map_err(refused)?;
+    times.lap("open the model");
+    let options = options(settings, context.seed());
+    let recording = recording(settings, &options, context, model.format())?;
+    let depth = DepthFrames::on_disk(context.output()).map_err(StageError::io(context.output()))?;
+    let mut windows = 0;
+    let result = reconstruct_recording(&recording, &model, &options, depth, &mut |progress| {
+        times.lap(match progress.part {
+            Part::Read => "read the video",
+            Part::Decode => "decode",
+            Part::Stitch => "stitch",
+        });
+        windows = progress.windows;
+        if progress.part == Part::Stitch {
+            context.progress(progress.window as u64 + 1, windows as u64, "windows");
         }
-        (None, None) => None,
-    };
-    let setting = ReconstructionInfo {
-        title: recording.title.clone(),
-        video_rate: rate,
-        frames,
-        samples,
-        intrinsics: recording.intrinsics,
-        first: recording.first,
-        floor_fit: settings.floor.clone(),
-        anchor,
-        assumptions,
-        badges: recording.badges.clone(),
-        truth: recording.truth.clone(),
-    };
-    let mut folder = Folder::new(&context.output().join(FOLDER), setting)
-        .map_err(StageError::other)?
-        .with_format(&format);
-    let request = GenerationRequest {
-        inputs: &inputs,
-        targets: &targets,
-        decoding: &settings.decoding.settings,
-        seed: context.seed(),
-    };
-    let mut stream = recording.stream(&list, &format)?;
-    for window in &list {
-        if context.interrupted() {
-            return Err(StageError::Interrupted);
-        }
-        let rgb = times.take("read the video", || stream.window(window.index))?;
-        let mut clip = Clip::empty(format!("{}/{:06}", recording.title, window.index), "video");
-        clip.set(RGB, rgb.clone());
-        let made = times
-            .take("decode", || {
-                reconstructor.reconstruct(&[clip], &[window.index as u64], &request)
-            })
-            .map_err(refused)?;
-        for one in made {
-            times
-                .take("stitch", || {
-                    folder.push(window, rgb.frames.view(), &one.clip, &one.confidence)
-                })
-                .map_err(StageError::other)?;
-        }
-        context.progress(window.index as u64 + 1, list.len() as u64, "windows");
-    }
-    let manifest = times
-        .take("write", || folder.finish())
+        let stop = context.interrupted();
+        if stop { Flow::Stop } else { Flow::Continue }
+    })
+    .map_err(failed)?;
+    let manifest = result
+        .write(context.output().join(FOLDER))
         .map_err(StageError::other)?;
-    times.record(context, list.len())?;
+    times.lap("write");
+    times.record(context, windows)?;
     Ok(json!({
         "seconds": recording.seconds,
-        "windows": list.len(),
-        "modalities": targets,
+        "windows": windows,
+        "modalities": options.targets_of(&model),
         "scale": manifest.scale,
         "files": manifest.files,
     }))
+}
+
+fn options(settings: &ReconstructSettings, seed: u64) -> ReconstructOptions {
+    ReconstructOptions {
+        start: settings.start,
+        seconds: settings.seconds,
+        inputs: settings.inputs.clone(),
+        targets: settings.targets.clone(),
+        decoding: settings.decoding.settings.clone(),
+        decoding_name: settings.decoding.name.clone(),
+        overlap: settings.overlap,
+        camera: settings.lens,
+        floor: settings.floor.clone(),
+        anchor: match (&settings.anchor, &settings.anchor_model) {
+            (Some(path), _) => Some(Anchor::Maps(path.0.clone().into())),
+            (None, Some(folder)) => Some(Anchor::Model(folder.0.clone().into())),
+            (None, None) => None,
+        },
+        seed,
+    }
+}
+
+/// What the settings name.
+fn recording(
+    settings: &ReconstructSettings,
+    options: &ReconstructOptions,
+    context: &dyn StageContext,
+    format: &ClipFormat,
+) -> Result<Recording, StageError> {
+    if let Some(path) = &settings.video {
+        let video = Video::open_with(path, &settings.reading)
+            .map_err(|error| failed(ReconstructError::Read(error)))?;
+        let range = [Some(options.start), options.seconds];
+        return Recording::of_video(video, range, &options.camera, format).map_err(failed);
+    }
+    let Some(artifact) = context.inputs("clips").first() else {
+        return Err(input("nothing to reconstruct", "name a file in `video`"));
+    };
+    let clips = ClipSet::open(&artifact.path.join(&settings.split)).map_err(StageError::other)?;
+    if settings.clip >= clips.len() {
+        return Err(input(
+            format_args!("split `{}` has {} clips", settings.split, clips.len()),
+            "choose a smaller `clip`",
+        ));
+    }
+    let clip = clips.clip(settings.clip).map_err(StageError::other)?;
+    Recording::of_clip(clip, &options.camera, format).map_err(failed)
+}
+
+/// What stopped a reconstruction, with the way out.
+fn failed(error: ReconstructError) -> StageError {
+    let help = match error {
+        ReconstructError::Stopped => return StageError::Interrupted,
+        ReconstructError::Model(error) => return refused(error),
+        error @ ReconstructError::Folder(_) => return StageError::other(error),
+        ReconstructError::NothingLeft { .. } => "choose a smaller `start`, or another video",
+        ReconstructError::NoColour { .. } => "choose another clip",
+        ReconstructError::Ends { .. } | ReconstructError::Read(_) => {
+            "check the file, or convert it with `ffmpeg`"
+        }
+        ReconstructError::NoCameraPath => "add `camera` to `targets`",
+        ReconstructError::Camera(_) => "correct `lens`",
+        ReconstructError::Windows(_) => "choose another `overlap`",
+        ReconstructError::Anchor(_) => "see `anchor` in `reviv show reconstruct`",
+        ReconstructError::AnchorModel(_) => {
+            "`reviv import FILE --depth metric -o DIR` makes the folder of a depth network"
+        }
+    };
+    input(error, help)
+}
+
+fn input(message: impl Display, help: &str) -> StageError {
+    StageError::Input {
+        code: Code::E0601,
+        message: message.to_string(),
+        help: help.to_owned(),
+    }
 }

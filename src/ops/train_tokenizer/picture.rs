@@ -4,10 +4,8 @@
 //! channel; joints over time: a panel per axis of a few joints.
 
 use crate::modality::Shape;
+use crate::training::tokenizer_scores::Example;
 use std::fmt::Write;
-
-/// Clips of video in the picture.
-pub(super) const VIDEOS: usize = 3;
 
 /// Frames of each.
 const FRAMES: usize = 6;
@@ -17,16 +15,6 @@ const GAP: usize = 4;
 
 /// Frames are enlarged to about this many pixels.
 const SIDE: usize = 128;
-
-/// One held-out clip.
-#[derive(Debug, Clone)]
-pub(super) struct Example {
-    pub truth: Vec<f32>,
-    /// Per sample or joint; `None`: all valid.
-    pub valid: Option<Vec<bool>>,
-    pub found: Vec<f32>,
-    pub kmeans: Option<Vec<f32>>,
-}
 
 /// The name of the file below `report/` and its bytes; `None` where there is nothing to show.
 pub(super) fn draw(shape: &Shape, examples: &[Example]) -> Option<(&'static str, Vec<u8>)> {

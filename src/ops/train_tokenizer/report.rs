@@ -1,9 +1,9 @@
 //! The section of a tokenizer on the page of its run.
 
 use super::TrainTokenizerSettings;
-use super::scores::Scores;
 use crate::experiment::TokenFacts;
 use crate::modality::Shape;
+use crate::training::tokenizer_scores::Scores;
 use std::fmt::Write;
 
 /// Words for the metrics; others are shown by name.

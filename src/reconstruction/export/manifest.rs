@@ -25,6 +25,7 @@ pub struct ArrayFacts {
     pub file: String,
     /// Name within the file.
     pub name: String,
+    /// Of the array.
     pub shape: Vec<usize>,
     /// In words: `m`, `image width and height`.
     pub unit: String,
@@ -32,6 +33,7 @@ pub struct ArrayFacts {
     pub frame: String,
     /// Hz; `None` for arrays without time.
     pub rate: Option<f64>,
+    /// Whether its numbers are metric, and by what.
     pub scale: ScaleStatus,
     /// The array of the same file that says which entries are known; `None` means unknown entries are NaN.
     pub validity: Option<String>,

@@ -1,23 +1,24 @@
 //! The arrays and exports of a reconstruction folder.
 
-use super::{Folder, FolderError, Manifest, NEAREST};
+use super::{FolderError, Manifest};
 use crate::reconstruction::export::files::Files;
 use crate::reconstruction::export::manifest::ArrayFacts;
-use crate::reconstruction::export::ply::{Point, write_ply};
-use crate::reconstruction::stitch::Tracks;
+use crate::reconstruction::export::ply::write_ply;
+use crate::reconstruction::result::Reconstruction;
+use crate::reconstruction::scale::NEAREST;
 use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::Path;
 
-impl Folder {
+impl Reconstruction {
     pub(super) fn write_tracks(
         &self,
-        tracks: &Tracks,
+        path: &Path,
         manifest: &mut Manifest,
     ) -> Result<(), FolderError> {
-        let frames = (self.video.len(), self.setting.video_rate);
-        let mut files = Files::new(&self.path, self.setting.intrinsics, frames);
-        for (_, track) in tracks.iter() {
+        let frames = (self.video.len(), self.info.video_rate);
+        let mut files = Files::new(path, self.info.intrinsics, frames);
+        for (_, track) in self.tracks.iter() {
             track.write(&mut files)?;
         }
         let (arrays, names) = files.finish()?;
@@ -28,23 +29,25 @@ impl Folder {
 
     pub(super) fn write_points(
         &self,
-        cloud: &[Point],
+        path: &Path,
         manifest: &mut Manifest,
     ) -> Result<(), FolderError> {
-        if cloud.is_empty() {
+        if self.cloud.is_empty() {
             return Ok(());
         }
         let note = format!("reviv: world, z up, {}", manifest.scale.words());
-        write_file(&self.path, "points.ply", &mut manifest.files, |out| {
-            write_ply(cloud, &note, out).map_err(|error| FolderError::Io {
-                path: self.path.clone(),
-                error,
-            })
+        write_file(path, "points.ply", &mut manifest.files, |out| {
+            write_ply(&self.cloud, &note, out).map_err(FolderError::io(path))
         })
     }
 
-    pub(super) fn write_depth(self, manifest: &mut Manifest) -> Result<(), FolderError> {
-        if self.spool.frames() == 0 {
+    pub(super) fn write_depth(
+        &self,
+        path: &Path,
+        manifest: &mut Manifest,
+    ) -> Result<(), FolderError> {
+        let frames = &self.depth.frames;
+        if frames.frames() == 0 {
             return Ok(());
         }
         let (scale, shift) = manifest
@@ -55,9 +58,7 @@ impl Folder {
         } else {
             "relative"
         };
-        let shape =
-            self.spool
-                .write_npz(&self.path.join("depth.npz"), name, [scale, shift], NEAREST)?;
+        let shape = frames.write_npz(&path.join("depth.npz"), name, [scale, shift], NEAREST)?;
         manifest.files.push("depth.npz".into());
         manifest.arrays.push(ArrayFacts {
             file: "depth.npz".into(),
@@ -70,7 +71,7 @@ impl Folder {
             }
             .into(),
             frame: "along the optical axis of the frame's camera, over the square image".into(),
-            rate: Some(self.setting.video_rate),
+            rate: Some(self.info.video_rate),
             scale: manifest.scale.clone(),
             validity: None,
         });

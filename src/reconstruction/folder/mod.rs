@@ -1,4 +1,4 @@
-//! One folder with everything: arrays, exports, manifest and page, built window by window.
+//! A reconstruction, built window by window, and the folder it is written to: arrays, exports, manifest and page.
 //!
 //! Here is what goes in and the scale fit; [`files`] writes arrays and exports, [`page`] puts the page together.
 
@@ -12,24 +12,23 @@ use super::export::files::sample_of;
 use super::export::manifest::ArrayFacts;
 use super::export::ply::Point;
 pub use super::folder_error::FolderError;
-use super::frame_buffer::DepthSpool;
+use super::frame_buffer::DepthFrames;
 use super::predictions::ScaleStatus;
-use super::scale::{
-    DepthFit, DepthRay, FloorFit, ScaleRefusal, fit_anchor, fit_floor, floor_height,
-};
+use super::result::{Depth, Reconstruction, ReconstructionInfo};
+use super::scale::{DepthFit, DepthRay, ScaleRefusal, fit_anchor, fit_floor, floor_height};
 use super::stitch::{Stitcher, Tracks, WindowBoundary, gravity_to_world};
 use super::windows::Window;
-use crate::clip::clock::{SIGNAL_RATE, SIGNAL_SAMPLES};
+use crate::clip::clock::SIGNAL_SAMPLES;
 use crate::clip::{Clip, Intrinsics};
 use crate::geometry::rigid::Rigid;
 use crate::geometry::skeleton::BODY;
 use crate::modality::ClipFormat;
-use crate::view::{Badge, Fact, VideoFrames, write_page};
+use crate::view::{VideoFrames, write_page};
 use ndarray::{Array2, Array3, ArrayView2, ArrayView3, ArrayView4, Axis};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::io::Write;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 /// The name of the folder inside an artifact.
 pub const FOLDER: &str = "reconstruction";
@@ -40,33 +39,6 @@ pub const PAGE: &str = "view.html";
 const GRID: usize = 64;
 /// Points of the whole recording in `points.ply` and in the fits, at most.
 const POINTS: usize = 2_000_000;
-/// Depth is never nearer than this, metres.
-const NEAREST: f32 = 0.01;
-
-/// What is known, or assumed, before the first window.
-#[derive(Debug, Clone)]
-pub struct ReconstructionInfo {
-    pub title: String,
-    /// Hz of the model's video.
-    pub video_rate: f64,
-    /// Video frames and motion samples of the whole reconstruction.
-    pub frames: usize,
-    pub samples: usize,
-    /// Of the square frames that are pushed.
-    pub intrinsics: Intrinsics,
-    /// World pose of the first camera.
-    pub first: Rigid,
-    pub floor_fit: FloorFit,
-    /// `[T, S, S]` metric depth of another model at the frames of this video; NaN where unknown.
-    pub anchor: Option<Array3<f32>>,
-    /// What was assumed and where it came from, with the flag that overrides it.
-    pub assumptions: Vec<Fact>,
-    /// Beside the scale status: `synthetic`, ...
-    pub badges: Vec<Badge>,
-    /// The true clip, where it is known and the video is one clip.
-    pub truth: Option<Clip>,
-}
-
 /// What `manifest.json` of the folder holds.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Manifest {
@@ -88,14 +60,13 @@ pub struct Manifest {
     pub files: Vec<String>,
 }
 
-/// Builds the folder window by window.
+/// Builds a reconstruction window by window.
 #[derive(Debug)]
-pub struct Folder {
-    path: PathBuf,
-    setting: ReconstructionInfo,
+pub struct Builder {
+    info: ReconstructionInfo,
     stitcher: Stitcher,
     depth: DepthStitcher,
-    spool: DepthSpool,
+    frames: DepthFrames,
     grids: Vec<Array2<f32>>,
     video: VideoFrames,
     /// Colours of the frames on the depth grid, for the points.
@@ -103,28 +74,20 @@ pub struct Folder {
     confidence: BTreeMap<String, Vec<f32>>,
 }
 
-impl Folder {
-    /// Starts the folder `path`.
-    ///
-    /// # Errors
-    /// When it cannot be made or written to.
-    pub fn new(path: &Path, setting: ReconstructionInfo) -> Result<Self, FolderError> {
-        let io = |error| FolderError::Io {
-            path: path.to_owned(),
-            error,
-        };
-        std::fs::create_dir_all(path).map_err(io)?;
-        Ok(Self {
-            spool: DepthSpool::new(path).map_err(io)?,
-            path: path.to_owned(),
-            stitcher: Stitcher::new(setting.first),
-            video: VideoFrames::new(setting.video_rate),
-            setting,
+impl Builder {
+    /// Starts a reconstruction whose depth goes into `frames`.
+    #[must_use]
+    pub fn new(info: ReconstructionInfo, frames: DepthFrames) -> Self {
+        Self {
+            frames,
+            stitcher: Stitcher::new(info.first),
+            video: VideoFrames::new(info.video_rate),
+            info,
             depth: DepthStitcher::default(),
             grids: Vec::new(),
             colors: Vec::new(),
             confidence: BTreeMap::new(),
-        })
+        }
     }
 
     /// With what the modalities of the decoded clips say of themselves: channels, units, rates.
@@ -146,9 +109,9 @@ impl Folder {
         decoded: &Clip,
         confidence: &BTreeMap<String, Vec<f32>>,
     ) -> Result<(), FolderError> {
-        let start = window.start_frame(self.setting.video_rate);
+        let start = window.start_frame(self.info.video_rate);
         for (index, frame) in rgb.axis_iter(Axis(0)).enumerate() {
-            if start + index == self.video.len() && self.video.len() < self.setting.frames {
+            if start + index == self.video.len() && self.video.len() < self.info.frames {
                 self.video.push(frame)?;
                 self.colors.push(sample_colors(frame));
             }
@@ -173,74 +136,60 @@ impl Folder {
         Ok(())
     }
 
-    /// Fits the scale and writes everything.
+    /// Fits the scale.
     ///
     /// # Errors
-    /// When a file cannot be written.
-    pub fn finish(mut self) -> Result<Manifest, FolderError> {
-        let (rest, depth_seams) = std::mem::take(&mut self.depth).finish();
+    /// When the disk that depth is held on is full.
+    pub fn finish(mut self) -> Result<Reconstruction, FolderError> {
+        let (rest, depth_boundaries) = std::mem::take(&mut self.depth).finish();
         self.take_depth(&rest)?;
+        self.frames.flush().map_err(disk())?;
         let fresh = self.stitcher.another();
-        let (tracks, seams) = std::mem::replace(&mut self.stitcher, fresh).finish();
+        let truth = self.info.truth.as_ref().map(|clip| {
+            let whole = Window {
+                index: 0,
+                start: 0,
+                inside: self.info.samples,
+                overlap: 0,
+            };
+            let mut stitcher = fresh.another();
+            stitcher.push(&whole, clip);
+            stitcher.finish().0
+        });
+        let (tracks, boundaries) = std::mem::replace(&mut self.stitcher, fresh).finish();
         let feet = foot_heights(&tracks);
-        let floor = floor_height(&feet, self.setting.floor_fit.rule).ok();
+        let floor = floor_height(&feet, self.info.floor_fit.rule).ok();
         let (scale, fit, refused) = self.fit_scale(&tracks, floor);
         if let Some(fit) = &fit {
             for grid in &mut self.grids {
-                grid.mapv_inplace(|d| (fit.scale as f32 * d + fit.shift as f32).max(NEAREST));
+                grid.mapv_inplace(|d| fit.apply(d));
             }
         }
         let cloud = self.cloud(&tracks);
-        let mut manifest = Manifest {
-            title: self.setting.title.clone(),
-            assumptions: self
-                .setting
-                .assumptions
-                .iter()
-                .map(|f| [f.label.clone(), f.value.clone()])
-                .collect(),
-            seconds: self.setting.samples as f64 / SIGNAL_RATE,
-            intrinsics: self.setting.intrinsics,
-            scale,
-            fit,
-            refused,
-            arrays: Vec::new(),
-            seams,
-            depth_seams,
-            confidence: self
-                .confidence
-                .iter()
-                .map(|(k, v)| (k.clone(), mean(v)))
-                .collect(),
-            files: Vec::new(),
-        };
-        self.write_tracks(&tracks, &mut manifest)?;
-        self.write_points(&cloud, &mut manifest)?;
-        let page = self.page(&tracks, cloud, floor, &manifest);
-        let path = self.path.clone();
-        write_file(&path, PAGE, &mut manifest.files, |out| {
-            Ok(write_page(&page, out)?)
-        })?;
-        self.write_depth(&mut manifest)?;
-        manifest.files.push("manifest.json".into());
-        manifest.files.sort();
-        let json = serde_json::to_vec_pretty(&manifest)?;
-        write_file(&path, "manifest.json", &mut Vec::new(), |out| {
-            out.write_all(&json).map_err(|error| FolderError::Io {
-                path: path.clone(),
-                error,
-            })
-        })?;
-        Ok(manifest)
+        Ok(Reconstruction {
+            info: self.info,
+            tracks,
+            truth,
+            boundaries,
+            depth: Depth {
+                frames: self.frames,
+                scale,
+                fit,
+                refused,
+                boundaries: depth_boundaries,
+            },
+            confidence: self.confidence,
+            video: self.video,
+            grids: self.grids,
+            cloud,
+            floor,
+        })
     }
 
     fn take_depth(&mut self, frames: &[Array2<f32>]) -> Result<(), FolderError> {
         for frame in frames {
-            if self.spool.frames() < self.setting.frames {
-                self.spool.push(frame).map_err(|error| FolderError::Io {
-                    path: self.path.clone(),
-                    error,
-                })?;
+            if self.frames.frames() < self.info.frames {
+                self.frames.push(frame).map_err(disk())?;
                 self.grids.push(thin(frame.view()));
             }
         }
@@ -255,7 +204,7 @@ impl Folder {
         if self.grids.is_empty() {
             return (ScaleStatus::None, None, None);
         }
-        let (by, fit) = match &self.setting.anchor {
+        let (by, fit) = match &self.info.anchor {
             Some(anchor) => ("anchor depth", self.fit_to_anchor(anchor)),
             None if tracks.camera().is_empty() => ("floor fit", Err(ScaleRefusal::NoCamera)),
             None if tracks.body().is_empty() => ("floor fit", Err(ScaleRefusal::NoBody)),
@@ -274,7 +223,7 @@ impl Folder {
             let pose = tracks.camera()[self.sample_of(frame, tracks.camera().len())];
             for ((row, column), &depth) in grid.indexed_iter() {
                 let [x, y] = ray(
-                    &self.setting.intrinsics,
+                    &self.info.intrinsics,
                     [grid.nrows(), grid.ncols()],
                     row,
                     column,
@@ -282,7 +231,7 @@ impl Folder {
                 rays.push(DepthRay::new(f64::from(depth), &pose, x, y));
             }
         }
-        fit_floor(&rays, floor, &self.setting.floor_fit)
+        fit_floor(&rays, floor, &self.info.floor_fit)
     }
 
     fn fit_to_anchor(&self, anchor: &Array3<f32>) -> Result<DepthFit, ScaleRefusal> {
@@ -308,7 +257,7 @@ impl Folder {
     }
 
     fn sample_of(&self, frame: usize, samples: usize) -> usize {
-        sample_of(frame, self.setting.video_rate, samples)
+        sample_of(frame, self.info.video_rate, samples)
     }
 
     fn cloud(&self, tracks: &Tracks) -> Vec<Point> {
@@ -322,13 +271,61 @@ impl Folder {
             points.extend(lift(
                 grid.view(),
                 colors.view(),
-                &self.setting.intrinsics,
+                &self.info.intrinsics,
                 pose,
                 1,
             ));
         }
         points
     }
+}
+
+impl Reconstruction {
+    /// Writes arrays, exports, manifest and page into `folder`, which is made where it is missing; the files are the same for
+    /// the same reconstruction, wherever its depth was held.
+    ///
+    /// # Errors
+    /// When a file cannot be written.
+    pub fn write(&self, folder: impl AsRef<Path>) -> Result<Manifest, FolderError> {
+        let path = folder.as_ref();
+        std::fs::create_dir_all(path).map_err(FolderError::io(path))?;
+        let assumptions = self.info.assumptions.iter();
+        let confidence = self.confidence.iter();
+        let mut manifest = Manifest {
+            title: self.info.title.clone(),
+            assumptions: assumptions
+                .map(|f| [f.label.clone(), f.value.clone()])
+                .collect(),
+            seconds: self.seconds(),
+            intrinsics: self.info.intrinsics,
+            scale: self.depth.scale.clone(),
+            fit: self.depth.fit,
+            refused: self.depth.refused.clone(),
+            arrays: Vec::new(),
+            seams: self.boundaries.clone(),
+            depth_seams: self.depth.boundaries.clone(),
+            confidence: confidence.map(|(k, v)| (k.clone(), mean(v))).collect(),
+            files: Vec::new(),
+        };
+        self.write_tracks(path, &mut manifest)?;
+        self.write_points(path, &mut manifest)?;
+        let page = self.page(&manifest);
+        write_file(path, PAGE, &mut manifest.files, |out| {
+            Ok(write_page(&page, out)?)
+        })?;
+        self.write_depth(path, &mut manifest)?;
+        manifest.files.push("manifest.json".into());
+        manifest.files.sort();
+        let json = serde_json::to_vec_pretty(&manifest)?;
+        write_file(path, "manifest.json", &mut Vec::new(), |out| {
+            out.write_all(&json).map_err(FolderError::io(path))
+        })?;
+        Ok(manifest)
+    }
+}
+
+fn disk() -> impl FnOnce(std::io::Error) -> FolderError {
+    FolderError::io(Path::new("depth frames"))
 }
 
 /// Heights of both feet and toes over all samples.

@@ -1,26 +1,19 @@
 //! The page of a reconstruction folder.
 
-use super::{Folder, Manifest};
+use super::Manifest;
 use crate::clip::clock::SIGNAL_RATE;
 use crate::reconstruction::depth::stack;
-use crate::reconstruction::export::ply::Point;
 use crate::reconstruction::predictions::ScaleStatus;
+use crate::reconstruction::result::Reconstruction;
 use crate::reconstruction::stitch::{Tracks, WindowBoundary};
 use crate::reconstruction::track::Timeline;
-use crate::reconstruction::windows::Window;
 use crate::view::scene::Tone;
 use crate::view::{Badge, Confidence, DepthGrids, Fact, Part, Scene, Track};
 use ndarray::Array2;
 
-impl Folder {
-    pub(super) fn page(
-        &self,
-        tracks: &Tracks,
-        cloud: Vec<Point>,
-        floor: Option<f64>,
-        manifest: &Manifest,
-    ) -> Scene {
-        let mut badges = self.setting.badges.clone();
+impl Reconstruction {
+    pub(super) fn page(&self, manifest: &Manifest) -> Scene {
+        let mut badges = self.info.badges.clone();
         let tone = if matches!(manifest.scale, ScaleStatus::Metric { .. }) {
             Tone::Good
         } else {
@@ -32,7 +25,7 @@ impl Folder {
                 tone,
             });
         }
-        let mut facts = self.setting.assumptions.clone();
+        let mut facts = self.info.assumptions.clone();
         facts.push(fact(
             "World",
             "z up, metres, origin and heading of the first camera",
@@ -56,38 +49,26 @@ impl Folder {
         if let Some(seam) = worst_seam(&manifest.seams) {
             facts.push(fact("Largest seam", &seam));
         }
-        let mut list = vec![track_of("prediction", false, tracks, self.setting.samples)];
-        if let Some(truth) = &self.setting.truth {
-            let window = Window {
-                index: 0,
-                start: 0,
-                inside: self.setting.samples,
-                overlap: 0,
-            };
-            let mut stitcher = self.stitcher.another();
-            stitcher.push(&window, truth);
-            list.push(track_of(
-                "truth",
-                true,
-                &stitcher.finish().0,
-                self.setting.samples,
-            ));
+        let samples = self.info.samples;
+        let mut list = vec![track_of("prediction", false, &self.tracks, samples)];
+        if let Some(truth) = &self.truth {
+            list.push(track_of("truth", true, truth, samples));
         }
         let frames = self.grids.len().min(self.video.len());
         let depth = (frames > 0 && frames == self.video.len()).then(|| DepthGrids {
             metres: stack(&self.grids[..frames]),
         });
         Scene {
-            title: self.setting.title.clone(),
+            title: self.info.title.clone(),
             badges,
             facts,
             rate: SIGNAL_RATE,
-            samples: self.setting.samples,
-            intrinsics: self.setting.intrinsics,
+            samples,
+            intrinsics: self.info.intrinsics,
             video: (!self.video.is_empty()).then(|| self.video.clone()),
             depth,
-            cloud,
-            floor,
+            cloud: self.cloud.clone(),
+            floor: self.floor,
             tracks: list,
             confidence: self
                 .confidence

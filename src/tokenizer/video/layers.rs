@@ -9,9 +9,13 @@ use crate::engine::{Initialise, Parameter, Segments, parameters};
 /// Where the rows of an activation lie.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Extent {
+    /// Clips in the batch.
     pub samples: usize,
+    /// Frames of a clip.
     pub frames: usize,
+    /// Rows of a frame.
     pub height: usize,
+    /// Columns of a frame.
     pub width: usize,
 }
 

@@ -223,6 +223,7 @@ impl Network {
         })
     }
 
+    /// What it was made with.
     #[must_use]
     pub fn settings(&self) -> &VideoSettings {
         &self.settings

@@ -45,7 +45,9 @@ impl Default for VideoSettings {
 /// What happens to the resolution between two levels.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Resampling {
+    /// Height and width are halved.
     pub space: bool,
+    /// Time is halved.
     pub time: bool,
 }
 
@@ -53,6 +55,22 @@ pub struct Resampling {
 pub const COLOURS: usize = 3;
 
 impl VideoSettings {
+    /// The smallest, for tests and first tries; the entry `video_tiny`.
+    #[must_use]
+    pub fn tiny() -> Self {
+        Self {
+            channels: 16,
+            multipliers: vec![1, 2],
+            blocks: 1,
+            patch: 4,
+            latent_channels: 8,
+            levels: vec![8, 5, 5],
+            spatial: 8,
+            temporal: 4,
+            ..Self::default()
+        }
+    }
+
     /// Cosmos DV8x16x16.
     #[must_use]
     pub fn dv8x16x16() -> Self {

@@ -2,12 +2,11 @@
 //! and what it works on as metadata.
 
 use std::collections::BTreeMap;
-use std::path::Path;
 
 use super::{Network, VideoSettings, VideoTokenizer};
 use crate::engine::{Compute, EngineError, HostTensor, Initialise, Parameters, Values, Weights};
 use crate::tokenizer::normaliser::Normaliser;
-use crate::tokenizer::trained::{DEVIATION, FILE, MEAN};
+use crate::tokenizer::trained::{DEVIATION, MEAN};
 use crate::tokenizer::{Tokenizer, TokenizerError};
 
 /// What the file says it is.
@@ -104,16 +103,6 @@ impl VideoTokenizer {
         }
         Ok(tokenizer)
     }
-
-    /// Writes `tokenizer.safetensors` into `directory`; equal tokenizers give equal bytes.
-    ///
-    /// # Errors
-    /// When the file cannot be written.
-    pub fn write(&self, directory: &Path) -> Result<(), TokenizerError> {
-        self.weights()
-            .write(&directory.join(FILE))
-            .map_err(|error| TokenizerError::Other(error.to_string()))
-    }
 }
 
 #[cfg(test)]
@@ -139,7 +128,7 @@ mod tests {
                 one.calibrate(std::slice::from_ref(&signal)).unwrap();
             }
             one.write(folder.path()).unwrap();
-            let other = crate::tokenizer::open(folder.path()).unwrap();
+            let other = crate::tokenizer::open(folder.path(), &Compute::cpu()).unwrap();
             assert_eq!(other.modality(), "rgb");
             let tokens = one.encode(std::slice::from_ref(&signal)).unwrap();
             let again = other.encode(std::slice::from_ref(&signal)).unwrap();

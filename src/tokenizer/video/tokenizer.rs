@@ -12,6 +12,7 @@ use super::{Fsq, Network, VideoSettings, haar};
 use crate::clip::Signal;
 use crate::engine::parameters::to_host;
 use crate::tokenizer::normaliser::Normaliser;
+use crate::tokenizer::trained::FILE;
 use crate::tokenizer::{TokenGrid, Tokenizer, TokenizerError, check_tokens};
 
 /// A network with the modality and clip size it works on. Signals are `[frames, height, width, 3]` in [-1, 1].
@@ -68,6 +69,7 @@ impl VideoTokenizer {
         })
     }
 
+    /// Encoder and decoder.
     #[must_use]
     pub fn network(&self) -> &Network {
         &self.network
@@ -106,6 +108,7 @@ impl VideoTokenizer {
         Ok(())
     }
 
+    /// What it was made with.
     #[must_use]
     pub fn settings(&self) -> &VideoSettings {
         self.network.settings()
@@ -296,6 +299,12 @@ impl VideoTokenizer {
 }
 
 impl Tokenizer for VideoTokenizer {
+    fn write(&self, directory: &std::path::Path) -> Result<(), TokenizerError> {
+        self.weights()
+            .write(&directory.join(FILE))
+            .map_err(|error| TokenizerError::Other(error.to_string()))
+    }
+
     fn modality(&self) -> &str {
         &self.modality
     }

@@ -77,6 +77,37 @@ impl Default for VqSettings {
 }
 
 impl VqSettings {
+    /// For signals over time on two cores and minutes; the entry `vq_temporal_small`.
+    #[must_use]
+    pub fn temporal_small() -> Self {
+        Self {
+            codebook: 256,
+            code_width: 8,
+            compression: vec![4],
+            width: 64,
+            depth: 2,
+            heads: 4,
+            mlp_ratio: 2,
+            velocity_weight: 10.0,
+            ema_decay: 0.95,
+            dead_below: 0.5,
+            ..Self::default()
+        }
+    }
+
+    /// For joints over time on two cores and minutes; the entry `vq_kinematic_small`.
+    #[must_use]
+    pub fn kinematic_small() -> Self {
+        Self {
+            codebook: 512,
+            compression: vec![4, 3],
+            depth: 1,
+            velocity_weight: 0.0,
+            positions: GridOrder::Aligned,
+            ..Self::temporal_small()
+        }
+    }
+
     /// How signals of `shape` are cut.
     ///
     /// # Errors

@@ -1,12 +1,12 @@
 //! How well a tokenizer reconstructs clips it never saw, beside what is possible without one.
 
-use super::super::clip_signals::{Extracted, extract};
-use super::errors::{Errors, Gain};
-use super::picture::{Example, VIDEOS};
+use super::fit::{Callback, progress};
+use super::signals::{Extracted, extract};
+use super::tokenizer_errors::{Errors, Gain};
+use super::trainer::TrainingError;
 use crate::clip::Signal;
-use crate::clip::store::ClipSet;
+use crate::clip::source::ClipSource;
 use crate::evaluation::tokens::codebook_use;
-use crate::experiment::{StageContext, StageError};
 use crate::modality::Modality;
 use crate::tokenizer::Tokenizer;
 use serde::Serialize;
@@ -14,6 +14,9 @@ use std::collections::BTreeMap;
 
 /// Clips scored at a time.
 const CHUNK: usize = 32;
+
+/// Clips kept to look at.
+const EXAMPLES: usize = 3;
 
 /// What has to be beaten.
 pub(super) struct Baselines<'a> {
@@ -25,7 +28,7 @@ pub(super) struct Baselines<'a> {
 
 /// Errors on held-out clips by metric; the name says the unit.
 #[derive(Debug, Clone, Default, Serialize)]
-pub(super) struct Scores {
+pub struct Scores {
     /// Held-out clips that have the modality.
     pub clips: usize,
     /// Of the tokenizer.
@@ -44,45 +47,28 @@ pub(super) struct Scores {
     pub perplexity: Option<f64>,
 }
 
-impl Scores {
-    /// Into the metrics of the stage, at its last step.
-    pub(super) fn record(
-        &self,
-        step: u64,
-        context: &mut dyn StageContext,
-    ) -> Result<(), StageError> {
-        let mut scalars = Vec::new();
-        for (kind, errors) in [
-            ("validation", &self.reconstruction),
-            ("baseline_mean", &self.mean),
-            ("baseline_kmeans", &self.kmeans),
-        ] {
-            scalars.extend(
-                errors
-                    .iter()
-                    .map(|(name, v)| (format!("{kind}/{name}"), *v)),
-            );
-        }
-        for (name, value) in [("usage", self.usage), ("perplexity", self.perplexity)] {
-            scalars.extend(value.map(|value| (format!("codes/{name}"), value)));
-        }
-        let scalars: Vec<(&str, f64)> = scalars.iter().map(|(n, v)| (n.as_str(), *v)).collect();
-        if scalars.is_empty() {
-            return Ok(());
-        }
-        context.record(step, &scalars)
-    }
+/// One held-out clip to look at.
+#[derive(Debug, Clone)]
+pub struct Example {
+    /// The clip's own values.
+    pub truth: Vec<f32>,
+    /// Per sample or joint; `None`: all valid.
+    pub valid: Option<Vec<bool>>,
+    /// What comes back from its tokens.
+    pub found: Vec<f32>,
+    /// What comes back from k-means.
+    pub kmeans: Option<Vec<f32>>,
 }
 
-/// Scores `tokenizer` on the first `most` clips of `set` that have the modality, and keeps some to look at.
-pub(super) fn score(
-    set: &ClipSet,
+/// Scores `tokenizer` on the first `most` clips of `source` that have the modality, and keeps some to look at.
+pub(super) fn score<E: From<TrainingError>>(
+    source: &dyn ClipSource,
     most: usize,
     modality: &dyn Modality,
     tokenizer: &dyn Tokenizer,
     baselines: &Baselines<'_>,
-    context: &mut dyn StageContext,
-) -> Result<(Scores, Vec<Example>), StageError> {
+    callback: &mut Callback<'_, E>,
+) -> Result<(Scores, Vec<Example>), E> {
     let beside: &[&str] = match modality.name() {
         "gaze" => &["camera"],
         _ => &[],
@@ -92,14 +78,11 @@ pub(super) fn score(
     let mut clips = 0;
     let mut examples = Vec::new();
     for start in (0..most).step_by(CHUNK) {
-        if context.interrupted() {
-            return Err(StageError::Interrupted);
-        }
         let end = (start + CHUNK).min(most);
-        let found = extract(set, modality, beside, start..end)?;
+        let found = extract(source, modality, beside, start..end)?;
         let signals: Vec<Signal> = found.iter().map(|found| found.signal.clone()).collect();
-        let grids = tokenizer.encode(&signals).map_err(StageError::other)?;
-        let decoded = tokenizer.decode(&grids).map_err(StageError::other)?;
+        let grids = tokenizer.encode(&signals).map_err(TrainingError::from)?;
+        let decoded = tokenizer.decode(&grids).map_err(TrainingError::from)?;
         for (Extracted { clip, signal }, decoded) in found.iter().zip(decoded) {
             let values: Vec<f32> = decoded.values.iter().copied().collect();
             own.compare(modality, clip, signal, &values);
@@ -108,7 +91,7 @@ pub(super) fn score(
             if let Some(values) = &codebook {
                 kmeans.compare(modality, clip, signal, values);
             }
-            if examples.len() < VIDEOS {
+            if examples.len() < EXAMPLES {
                 examples.push(Example {
                     truth: signal.values.iter().copied().collect(),
                     valid: signal.valid.as_ref().map(|v| v.iter().copied().collect()),
@@ -119,9 +102,12 @@ pub(super) fn score(
         }
         ids.extend(grids.into_iter().flat_map(|grid| grid.ids).map(i64::from));
         clips += found.len();
-        context.progress(end as u64, most as u64, "held-out clips");
+        progress(callback, end, most, "held-out clips")?;
     }
-    let used = codebook_use(ids, tokenizer.vocabulary()).map_err(StageError::other)?;
+    let used = codebook_use(ids, tokenizer.vocabulary()).map_err(|error| TrainingError::Clip {
+        clip: "held out".to_owned(),
+        reason: error.to_string(),
+    })?;
     let scores = Scores {
         clips,
         reconstruction: own.means(),

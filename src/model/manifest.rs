@@ -1,10 +1,15 @@
 //! What binds the parts of a model folder together: the clips it takes, and its tokenizers by their bytes.
 
-use super::{FILE, ReconstructorError, TOKENIZERS};
+use super::error::{ModelError, not_a_model};
 use crate::modality::ClipFormat;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+
+/// The file in a model folder that binds its parts together.
+pub const FILE: &str = "model.json";
+/// The folder of tokenizers in a model folder.
+pub const TOKENIZERS: &str = "tokenizers";
 
 /// What [`FILE`] holds.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -21,7 +26,7 @@ impl ModelManifest {
     ///
     /// # Errors
     /// When a file cannot be read.
-    pub fn of(folder: &Path, clips: ClipFormat) -> Result<Self, ReconstructorError> {
+    pub fn of(folder: &Path, clips: ClipFormat) -> Result<Self, ModelError> {
         let tokenizers = Self::digests(folder)?;
         Ok(Self { clips, tokenizers })
     }
@@ -30,7 +35,7 @@ impl ModelManifest {
     ///
     /// # Errors
     /// When a file cannot be read.
-    pub fn digests(folder: &Path) -> Result<BTreeMap<String, String>, ReconstructorError> {
+    pub fn digests(folder: &Path) -> Result<BTreeMap<String, String>, ModelError> {
         let root = folder.join(TOKENIZERS);
         let mut tokenizers = BTreeMap::new();
         for path in entries(&root)? {
@@ -47,18 +52,18 @@ impl ModelManifest {
     ///
     /// # Errors
     /// When it cannot be written.
-    pub fn write(&self, folder: &Path) -> Result<(), ReconstructorError> {
+    pub fn write(&self, folder: &Path) -> Result<(), ModelError> {
         let path = folder.join(FILE);
         let text =
             serde_json::to_string_pretty(self).map_err(|error| not_a_model(folder, error))?;
-        std::fs::write(&path, text + "\n").map_err(|error| ReconstructorError::Io { path, error })
+        std::fs::write(&path, text + "\n").map_err(|error| ModelError::Io { path, error })
     }
 
     /// Reads [`FILE`] of `folder`.
     ///
     /// # Errors
     /// When it is not there or not of this form.
-    pub fn read(folder: &Path) -> Result<Self, ReconstructorError> {
+    pub fn read(folder: &Path) -> Result<Self, ModelError> {
         let text = std::fs::read_to_string(folder.join(FILE))
             .map_err(|error| not_a_model(folder, format_args!("`{FILE}`: {error}")))?;
         serde_json::from_str(&text)
@@ -66,16 +71,9 @@ impl ModelManifest {
     }
 }
 
-pub(super) fn not_a_model(path: &Path, reason: impl std::fmt::Display) -> ReconstructorError {
-    ReconstructorError::NotAModel {
-        path: path.to_owned(),
-        reason: reason.to_string(),
-    }
-}
-
 /// What lies in a folder, by name; nothing where there is no folder.
-fn entries(folder: &Path) -> Result<Vec<PathBuf>, ReconstructorError> {
-    let wrong = |error| ReconstructorError::Io {
+fn entries(folder: &Path) -> Result<Vec<PathBuf>, ModelError> {
+    let wrong = |error| ModelError::Io {
         path: folder.to_owned(),
         error,
     };
@@ -92,13 +90,13 @@ fn entries(folder: &Path) -> Result<Vec<PathBuf>, ReconstructorError> {
 }
 
 /// The hash of names and bytes of the files of a folder.
-pub(super) fn digest(folder: &Path) -> Result<String, ReconstructorError> {
+pub(super) fn digest(folder: &Path) -> Result<String, ModelError> {
     let mut hasher = blake3::Hasher::new();
     for path in entries(folder)?.into_iter().filter(|path| path.is_file()) {
         let name = path.file_name().unwrap_or_default().to_string_lossy();
         hasher.update(&(name.len() as u64).to_le_bytes());
         hasher.update(name.as_bytes());
-        let wrong = |error| ReconstructorError::Io {
+        let wrong = |error| ModelError::Io {
             path: path.clone(),
             error,
         };

@@ -1,80 +1,49 @@
-//! A model folder as one function: clips in, the signals they lack out (Sec. 4.1).
+//! A [`Model`]: MGET with its tokenizers, as one function from clips to the signals they lack (Sec. 4.1).
 //!
-//! A model folder holds MGET (`mget.json`, `weights.safetensors`), the tokenizers it was trained on
-//! (`tokenizers/<modality>/`), and [`FILE`], which says what clips it takes and names the tokenizers by their bytes, so that a
-//! model and tokenizers that do not belong together are found before anything is decoded into nonsense.
+//! It comes out of a model folder ([`Model::open`]), out of training (`Model::train`) or out of imported weights. A model folder
+//! holds MGET (`mget.json`, `weights.safetensors`), the tokenizers it was trained on (`tokenizers/<modality>/`), and [`FILE`],
+//! which says what clips it takes and names the tokenizers by their bytes, so that a model and tokenizers that do not belong
+//! together are found before anything is decoded into nonsense.
 
+mod error;
+mod evaluate;
 mod manifest;
+mod tokenizers;
 
-pub use manifest::ModelManifest;
+pub use error::ModelError;
+pub use evaluate::{EvaluateError, EvaluateOptions, evaluate, table};
+pub use manifest::{FILE, ModelManifest, TOKENIZERS};
+pub use tokenizers::Tokenizers;
 
-use self::manifest::{digest, not_a_model};
-use super::{
-    DecodingError, DecodingSettings, Generated, GeneratedTokens, MgetTokens, Sample, Slot,
-    generate_samples,
-};
+use self::error::{not_a_model, wrong_clip};
+use self::manifest::digest;
 use crate::clip::{Clip, Signal};
-use crate::engine::Compute;
+use crate::decoding::{
+    DecodingSettings, Generated, GeneratedTokens, MgetTokens, Sample, Slot, generate_samples,
+};
+use crate::engine::{Compute, Parameters};
 use crate::masking::PIXELS;
 use crate::mget::{Content, Mget, ModalitySpec};
-use crate::modality::{self, ClipFormat, Modality};
-use crate::tokenizer::{self, TokenGrid, Tokenizer, TokenizerError};
+use crate::modality::{ClipFormat, Modality};
+use crate::tokenizer::{self, TokenGrid, Tokenizer};
 use rand::RngExt;
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
-
-/// The file in a model folder that binds its parts together.
-pub const FILE: &str = "model.json";
-/// The folder of tokenizers in a model folder.
-pub const TOKENIZERS: &str = "tokenizers";
-
-/// Why a model folder cannot be used.
-#[derive(Debug, thiserror::Error)]
-pub enum ReconstructorError {
-    #[error("{path}: {error}")]
-    Io {
-        path: PathBuf,
-        error: std::io::Error,
-    },
-    #[error("{}: no model folder: {reason}", path.display())]
-    NotAModel { path: PathBuf, reason: String },
-    #[error(
-        "{}: the tokenizer of `{modality}` is not the one the model was trained on (expected {expected}, found {found})",
-        path.display()
-    )]
-    OtherTokenizer {
-        path: PathBuf,
-        modality: String,
-        expected: String,
-        found: String,
-    },
-    #[error(
-        "the tokenizer of `{modality}` has {found} tokens a clip of {vocabulary} kinds, the model expects {expected}"
-    )]
-    OtherGrid {
-        modality: String,
-        found: String,
-        vocabulary: usize,
-        expected: String,
-    },
-    #[error("no modality `{name}` in this model; it has: {known}")]
-    UnknownModality { name: String, known: String },
-    #[error("clip `{clip}` has no {modality}, which the model is to be given")]
-    MissingInput { clip: String, modality: String },
-    #[error("clip `{clip}`: {reason}")]
-    Clip { clip: String, reason: String },
-    #[error(transparent)]
-    Tokenizer(#[from] TokenizerError),
-    #[error(transparent)]
-    Decoding(#[from] DecodingError),
-}
+use std::path::Path;
 
 /// A model with its tokenizers.
-pub struct Reconstructor {
-    model: Mget,
-    format: ClipFormat,
-    modalities: BTreeMap<String, Box<dyn Modality>>,
-    tokenizers: BTreeMap<String, Box<dyn Tokenizer>>,
+#[derive(Clone)]
+pub struct Model {
+    mget: Mget,
+    tokenizers: Tokenizers,
+}
+
+impl std::fmt::Debug for Model {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Model")
+            .field("spec", self.mget.spec())
+            .field("tokenizers", &self.tokenizers)
+            .finish()
+    }
 }
 
 /// What to generate, and how.
@@ -85,7 +54,9 @@ pub struct GenerationRequest<'a> {
     pub inputs: &'a [String],
     /// Modalities to generate.
     pub targets: &'a [String],
+    /// How tokens are generated.
     pub decoding: &'a DecodingSettings,
+    /// Of the random numbers.
     pub seed: u64,
 }
 
@@ -105,27 +76,24 @@ pub struct Reconstructed {
     pub confidence: BTreeMap<String, Vec<f32>>,
 }
 
-impl Reconstructor {
+impl Model {
     /// Opens a model folder and checks that its parts belong together.
     ///
     /// # Errors
     /// When a part is missing, damaged, or another one than the model was trained on.
-    pub fn open(folder: &Path, compute: &Compute) -> Result<Self, ReconstructorError> {
-        let binding = ModelManifest::read(folder)?;
-        let model = Mget::open(folder, compute).map_err(|error| not_a_model(folder, error))?;
-        let modalities: BTreeMap<String, Box<dyn Modality>> = modality::all(&binding.clips)
-            .into_iter()
-            .map(|modality| (modality.name().to_owned(), modality))
-            .collect();
-        let mut tokenizers = BTreeMap::new();
-        for slot in &model.spec().modalities {
+    pub fn open(folder: impl AsRef<Path>, compute: &Compute) -> Result<Self, ModelError> {
+        let folder = folder.as_ref();
+        let manifest = ModelManifest::read(folder)?;
+        let mget = Mget::open(folder, compute).map_err(|error| not_a_model(folder, error))?;
+        let mut tokenizers = Tokenizers::new(manifest.clips);
+        for slot in &mget.spec().modalities {
             let name = &slot.name;
             // Raw video has no tokens; video of the release's other size is none of these clips'.
-            if slot.vocabulary().is_none() || !modalities.contains_key(name) {
+            if slot.vocabulary().is_none() || !tokenizers.knows(name) {
                 continue;
             }
             let path = folder.join(TOKENIZERS).join(name);
-            let expected = binding.tokenizers.get(name).ok_or_else(|| {
+            let expected = manifest.tokenizers.get(name).ok_or_else(|| {
                 not_a_model(
                     folder,
                     format_args!("`{FILE}` names no tokenizer of `{name}`"),
@@ -139,78 +107,126 @@ impl Reconstructor {
             }
             let found = digest(&path)?;
             if *expected != found {
-                return Err(ReconstructorError::OtherTokenizer {
+                return Err(ModelError::OtherTokenizer {
                     path,
                     modality: name.clone(),
                     expected: expected.clone(),
                     found,
                 });
             }
-            let tokenizer = tokenizer::open(&path)?;
+            tokenizers.insert_as(name, tokenizer::open(&path, compute)?.into());
+        }
+        Self::new(mget, tokenizers)
+    }
+
+    /// A transformer and the tokenizers it was trained on.
+    ///
+    /// # Errors
+    /// When a tokenizer has other tokens than the transformer predicts.
+    pub fn new(mget: Mget, tokenizers: Tokenizers) -> Result<Self, ModelError> {
+        for slot in &mget.spec().modalities {
+            let Some(tokenizer) = tokenizers.get(&slot.name) else {
+                continue;
+            };
             let count: usize = tokenizer.grid().iter().product();
             if count != slot.count() {
-                return Err(ReconstructorError::OtherGrid {
-                    modality: name.clone(),
+                return Err(ModelError::OtherGrid {
+                    modality: slot.name.clone(),
                     found: count.to_string(),
                     vocabulary: tokenizer.vocabulary(),
                     expected: slot.count().to_string(),
                 });
             }
-            tokenizers.insert(name.clone(), tokenizer);
         }
         Ok(Self {
-            model,
-            format: binding.clips,
-            modalities,
+            mget: mget.frozen(),
             tokenizers,
         })
     }
 
+    /// Writes a model folder, which [`Model::open`] reads; equal models give equal bytes.
+    ///
+    /// # Errors
+    /// When a file cannot be written.
+    pub fn write(&self, folder: impl AsRef<Path>) -> Result<(), ModelError> {
+        let folder = folder.as_ref();
+        let io = |error| ModelError::Io {
+            path: folder.to_owned(),
+            error,
+        };
+        std::fs::create_dir_all(folder).map_err(io)?;
+        self.mget.save(folder)?;
+        self.tokenizers.write(&folder.join(TOKENIZERS))?;
+        ModelManifest::of(folder, self.format().clone())?.write(folder)
+    }
+
     /// The sizes of the clips the model takes.
+    #[must_use]
     pub fn format(&self) -> &ClipFormat {
-        &self.format
+        self.tokenizers.format()
+    }
+
+    /// The transformer.
+    #[must_use]
+    pub fn mget(&self) -> &Mget {
+        &self.mget
+    }
+
+    /// The tokenizers.
+    #[must_use]
+    pub fn tokenizers(&self) -> &Tokenizers {
+        &self.tokenizers
+    }
+
+    /// Whether raw video is an input beside the tokens.
+    #[must_use]
+    pub fn takes_pixels(&self) -> bool {
+        self.mget.spec().index(PIXELS).is_some()
     }
 
     /// The modalities it knows, raw video aside.
     pub fn names(&self) -> impl Iterator<Item = &str> {
-        self.tokenizers.keys().map(String::as_str)
+        self.tokenizers.names()
     }
 
     /// One of its modalities.
     ///
     /// # Errors
     /// When it has none of this name.
-    pub fn modality(&self, name: &str) -> Result<&dyn Modality, ReconstructorError> {
-        match self.modalities.get(name) {
-            Some(modality) if self.tokenizers.contains_key(name) => Ok(modality.as_ref()),
-            _ => Err(self.unknown(name)),
-        }
+    pub fn modality(&self, name: &str) -> Result<&dyn Modality, ModelError> {
+        let found = self.tokenizers.modality(name);
+        found.ok_or_else(|| self.unknown(name))
     }
 
-    fn unknown(&self, name: &str) -> ReconstructorError {
-        ReconstructorError::UnknownModality {
+    fn tokenizer(&self, name: &str) -> Result<&dyn Tokenizer, ModelError> {
+        let found = self.tokenizers.get(name);
+        found.ok_or_else(|| self.unknown(name))
+    }
+
+    fn unknown(&self, name: &str) -> ModelError {
+        ModelError::UnknownModality {
             name: name.to_owned(),
             known: self.names().collect::<Vec<_>>().join(", "),
         }
     }
 
-    /// Generates what is wanted for a batch of clips. `ids` name their random numbers: a clip's result does not depend on the
+    /// Generates the targets of a batch of clips. `ids` name their random numbers: a clip's result does not depend on the
     /// others of its batch.
     ///
     /// # Errors
     /// When a modality is unknown, a clip lacks a given one, or a signal has another form than the model was trained on.
-    pub fn reconstruct(
+    pub fn predict(
         &self,
         clips: &[Clip],
         ids: &[u64],
         request: &GenerationRequest<'_>,
-    ) -> Result<Vec<Reconstructed>, ReconstructorError> {
+    ) -> Result<Vec<Reconstructed>, ModelError> {
         let conditioning = self.encode_inputs(clips, request.inputs)?;
         let generated = self.generate(&conditioning, ids, request)?;
         self.decode(clips, &generated, request)
     }
 
-    /// Generates the tokens of the targets, once per sample that is averaged; the middle of [`Reconstructor::reconstruct`].
+    /// Generates the tokens of the targets, once per sample that is averaged; the middle of [`Model::predict`].
     ///
     /// # Errors
     /// When a modality is unknown.
@@ -219,7 +235,7 @@ impl Reconstructor {
         conditioning: &Conditioning<'_>,
         ids: &[u64],
         request: &GenerationRequest<'_>,
-    ) -> Result<Vec<Vec<Generated>>, ReconstructorError> {
+    ) -> Result<Vec<Vec<Generated>>, ModelError> {
         let samples: Vec<Sample<'_>> = ids
             .iter()
             .enumerate()
@@ -229,7 +245,7 @@ impl Reconstructor {
             })
             .collect();
         let targets: Vec<&str> = request.targets.iter().map(String::as_str).collect();
-        let model = MgetTokens::new(&self.model);
+        let model = MgetTokens::new(&self.mget);
         let seeds: Vec<u64> = (0..request.decoding.samples.max(1))
             .map(|round| seed_of_round(request.seed, round))
             .collect();
@@ -242,7 +258,7 @@ impl Reconstructor {
         )?)
     }
 
-    /// Turns generated tokens of `clips` into signals; the end of [`Reconstructor::reconstruct`].
+    /// Turns generated tokens of `clips` into signals; the end of [`Model::predict`].
     ///
     /// # Errors
     /// When tokens and tokenizer do not fit.
@@ -251,7 +267,7 @@ impl Reconstructor {
         clips: &[Clip],
         rounds: &[Vec<Generated>],
         request: &GenerationRequest<'_>,
-    ) -> Result<Vec<Reconstructed>, ReconstructorError> {
+    ) -> Result<Vec<Reconstructed>, ModelError> {
         let mut made: Vec<Reconstructed> = clips
             .iter()
             .map(|clip| Reconstructed {
@@ -261,7 +277,7 @@ impl Reconstructor {
             .collect();
         for name in request.targets {
             let modality = self.modality(name)?;
-            let tokenizer = &self.tokenizers[name];
+            let tokenizer = self.tokenizer(name)?;
             let mut mean = Mean::default();
             for generated in rounds.iter().take(request.decoding.samples_of(name)) {
                 let own: Vec<&GeneratedTokens> = generated
@@ -296,15 +312,11 @@ impl Reconstructor {
     ///
     /// # Errors
     /// When a modality is unknown, or a signal has another form than the model was trained on.
-    pub fn round_trip(
-        &self,
-        clips: &[Clip],
-        names: &[String],
-    ) -> Result<Vec<Clip>, ReconstructorError> {
+    pub fn round_trip(&self, clips: &[Clip], names: &[String]) -> Result<Vec<Clip>, ModelError> {
         let empty = |clip: &Clip| Clip::empty(clip.id.clone(), clip.source.clone());
         let mut made: Vec<Clip> = clips.iter().map(empty).collect();
         for name in names {
-            let (modality, tokenizer) = (self.modality(name)?, &self.tokenizers[name]);
+            let (modality, tokenizer) = (self.modality(name)?, self.tokenizer(name)?);
             let (mut places, mut signals) = (Vec::new(), Vec::new());
             for (place, clip) in clips.iter().enumerate() {
                 let signal = modality.extract(clip);
@@ -323,7 +335,7 @@ impl Reconstructor {
         Ok(made)
     }
 
-    /// Encodes what is given; the beginning of [`Reconstructor::reconstruct`].
+    /// Encodes what is given; the beginning of [`Model::predict`].
     ///
     /// # Errors
     /// When a modality is unknown, or a clip lacks a given one.
@@ -331,17 +343,15 @@ impl Reconstructor {
         &self,
         clips: &[Clip],
         inputs: &'a [String],
-    ) -> Result<Conditioning<'a>, ReconstructorError> {
+    ) -> Result<Conditioning<'a>, ModelError> {
         let mut conditioning = Conditioning::default();
         for name in inputs {
-            let takes_pixels = self.model.spec().index(PIXELS).is_some();
+            let takes_pixels = self.takes_pixels();
             if takes_pixels && (name == PIXELS || name == "rgb") {
-                let rgb = self
-                    .modalities
-                    .get("rgb")
-                    .ok_or_else(|| self.unknown(name))?;
+                let rgb = self.tokenizers.known("rgb");
+                let rgb = rgb.ok_or_else(|| self.unknown(name))?;
                 let floats = |signal: &Signal| signal.values.iter().copied().collect();
-                conditioning.pixels = signals(rgb.as_ref(), clips)?.iter().map(floats).collect();
+                conditioning.pixels = signals(rgb, clips)?.iter().map(floats).collect();
             }
             if takes_pixels && name == PIXELS {
                 continue;
@@ -349,7 +359,7 @@ impl Reconstructor {
             let signals = signals(self.modality(name)?, clips)?;
             conditioning
                 .tokens
-                .insert(name, self.tokenizers[name].encode(&signals)?);
+                .insert(name, self.tokenizer(name)?.encode(&signals)?);
         }
         Ok(conditioning)
     }
@@ -366,28 +376,21 @@ impl Reconstructor {
             }
             None => Slot::masked(slot.count()),
         };
-        self.model.spec().modalities.iter().map(of).collect()
+        self.mget.spec().modalities.iter().map(of).collect()
     }
 }
 
-fn signals(modality: &dyn Modality, clips: &[Clip]) -> Result<Vec<Signal>, ReconstructorError> {
+fn signals(modality: &dyn Modality, clips: &[Clip]) -> Result<Vec<Signal>, ModelError> {
     let of = |clip: &Clip| {
         let signal = modality
             .extract(clip)
             .map_err(|error| wrong_clip(clip, error))?;
-        signal.ok_or_else(|| ReconstructorError::MissingInput {
+        signal.ok_or_else(|| ModelError::MissingInput {
             clip: clip.id.clone(),
             modality: modality.name().to_owned(),
         })
     };
     clips.iter().map(of).collect()
-}
-
-fn wrong_clip(clip: &Clip, reason: impl std::fmt::Display) -> ReconstructorError {
-    ReconstructorError::Clip {
-        clip: clip.id.clone(),
-        reason: reason.to_string(),
-    }
 }
 
 /// The first round has the seed itself.

@@ -13,9 +13,12 @@ const PSNR: &str = "psnr_db";
 
 /// A difference of errors on the same clips, positive where the first are better, with its 95 % interval over clips.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub(super) struct Gain {
+pub struct Gain {
+    /// Over clips.
     pub mean: f64,
+    /// The interval's lower end.
     pub low: f64,
+    /// The interval's upper end.
     pub high: f64,
 }
 

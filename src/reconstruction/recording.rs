@@ -1,16 +1,13 @@
 //! What is reconstructed: a video, or a stored clip with its truth.
 
-use super::ReconstructSettings;
-use crate::clip::store::ClipSet;
+use super::anchor;
+use super::error::ReconstructError;
+use super::lens::LensSettings;
+use super::windows::Window;
 use crate::clip::{Clip, Intrinsics, RGB, Rgb};
-use crate::experiment::{Code, InputArtifact, StageError};
-use crate::formats::ReadError;
 use crate::geometry::rigid::Rigid;
 use crate::labelling::{DepthLabeller, LabelError};
 use crate::modality::ClipFormat;
-use crate::reconstruction::anchor;
-use crate::reconstruction::lens::{LensError, LensSettings};
-use crate::reconstruction::windows::Window;
 use crate::video::image::Image;
 use crate::video::{self, Video};
 use crate::view::Fact;
@@ -23,18 +20,26 @@ use std::fmt::Display;
 const CLIP_SECONDS: f64 = 2.0;
 
 /// An opened recording.
-pub(super) struct Recording {
+#[derive(Debug)]
+pub struct Recording {
+    /// The video's or the clip's name.
     pub title: String,
+    /// How much of it is reconstructed.
     pub seconds: f64,
+    /// Of the square frames that the model sees.
     pub intrinsics: Intrinsics,
     /// World pose of the first camera.
     pub first: Rigid,
+    /// What is assumed of it, and where that comes from.
     pub assumptions: Vec<Fact>,
+    /// `synthetic`, ...
     pub badges: Vec<Badge>,
+    /// The clip without its video.
     pub truth: Option<Clip>,
     frames: Frames,
 }
 
+#[derive(Debug)]
 enum Frames {
     Video { video: Video, start: f64 },
     Clip(Rgb),
@@ -51,47 +56,29 @@ pub(super) struct Stream<'a> {
 }
 
 impl Recording {
-    /// Opens what the settings name.
-    pub fn open(
-        settings: &ReconstructSettings,
-        clips: Option<&InputArtifact>,
-        format: &ClipFormat,
-    ) -> Result<Self, StageError> {
-        match (&settings.video, clips) {
-            (Some(path), _) => {
-                let video = Video::open_with(path, &settings.reading)
-                    .map_err(|error| unreadable(&error))?;
-                Self::video(settings, video, format)
-            }
-            (None, Some(artifact)) => Self::clip(settings, artifact, format),
-            (None, None) => Err(input("nothing to reconstruct", "name a file in `video`")),
-        }
-    }
-
-    fn video(
-        settings: &ReconstructSettings,
+    /// A video from `start` on, at most `limit` seconds of it, for a model that takes clips of `format`.
+    ///
+    /// # Errors
+    /// When nothing is left of the video, or what is said of its camera cannot be.
+    pub fn of_video(
         video: Video,
+        [start, limit]: [Option<f64>; 2],
+        camera: &LensSettings,
         format: &ClipFormat,
-    ) -> Result<Self, StageError> {
+    ) -> Result<Self, ReconstructError> {
+        let start = start.unwrap_or(0.0);
         let info = video.info().clone();
-        let left = info.seconds() - settings.start;
+        let left = info.seconds() - start;
         if info.frames == 0 || left <= 0.0 || !left.is_finite() {
-            return Err(input(
-                format_args!(
-                    "`{}` has {} frames, {:.2} s; nothing is left from {:.2} s on",
-                    video.path().display(),
-                    info.frames,
-                    info.seconds(),
-                    settings.start
-                ),
-                "choose a smaller `start`, or another video",
-            ));
+            return Err(ReconstructError::NothingLeft {
+                path: video.path().to_owned(),
+                frames: info.frames,
+                seconds: info.seconds(),
+                start,
+            });
         }
         let size = [info.width, info.height];
-        let intrinsics = settings
-            .lens
-            .intrinsics(size, format.size as u32)
-            .map_err(|error| lens(&error))?;
+        let intrinsics = camera.intrinsics(size, format.size as u32)?;
         let square = info.width.min(info.height);
         let mut assumptions = vec![
             fact(
@@ -142,46 +129,35 @@ impl Recording {
                 ),
             ));
         }
-        assumptions.extend(said(&settings.lens, &intrinsics));
+        assumptions.extend(said(camera, &intrinsics));
         Ok(Self {
             title: video.path().file_stem().map_or_else(
                 || "video".into(),
                 |stem| stem.to_string_lossy().into_owned(),
             ),
-            seconds: settings.seconds.map_or(left, |limit| left.min(limit)),
+            seconds: limit.map_or(left, |limit| left.min(limit)),
             intrinsics,
-            first: settings.lens.first_pose().map_err(|error| lens(&error))?,
+            first: camera.first_pose()?,
             assumptions,
             badges: Vec::new(),
             truth: None,
-            frames: Frames::Video {
-                video,
-                start: settings.start,
-            },
+            frames: Frames::Video { video, start },
         })
     }
 
-    fn clip(
-        settings: &ReconstructSettings,
-        artifact: &InputArtifact,
+    /// A stored clip; what it knows of its camera goes before `camera`, and its truth is shown beside the prediction.
+    ///
+    /// # Errors
+    /// When it has no colour video, or what is said of its camera cannot be.
+    pub fn of_clip(
+        mut clip: Clip,
+        camera: &LensSettings,
         format: &ClipFormat,
-    ) -> Result<Self, StageError> {
-        let root = artifact.path.join(&settings.split);
-        let clips = ClipSet::open(&root).map_err(StageError::other)?;
-        if settings.clip >= clips.len() {
-            return Err(input(
-                format_args!("split `{}` has {} clips", settings.split, clips.len()),
-                "choose a smaller `clip`",
-            ));
-        }
-        let mut clip = clips.clip(settings.clip).map_err(StageError::other)?;
-        let rgb = clip.take(RGB).ok_or_else(|| {
-            input(
-                format_args!("clip `{}` has no colour video", clip.id),
-                "choose another clip",
-            )
+    ) -> Result<Self, ReconstructError> {
+        let rgb = clip.take(RGB).ok_or_else(|| ReconstructError::NoColour {
+            clip: clip.id.clone(),
         })?;
-        let mut lens_settings = settings.lens;
+        let mut lens_settings = *camera;
         let camera = clip.camera();
         let known = camera.and_then(|camera| camera.intrinsics);
         let mut up_known = false;
@@ -196,9 +172,7 @@ impl Recording {
         let size = format.size as u32;
         let intrinsics = match known {
             Some(known) => known,
-            None => lens_settings
-                .intrinsics([size, size], size)
-                .map_err(|error| lens(&error))?,
+            None => lens_settings.intrinsics([size, size], size)?,
         };
         let [mut lens_fact, mut up_fact] = said(&lens_settings, &intrinsics);
         if known.is_some() {
@@ -222,7 +196,7 @@ impl Recording {
             title: clip.id.clone(),
             seconds: CLIP_SECONDS,
             intrinsics,
-            first: lens_settings.first_pose().map_err(|error| lens(&error))?,
+            first: lens_settings.first_pose()?,
             assumptions,
             badges,
             truth: Some(clip),
@@ -231,11 +205,11 @@ impl Recording {
     }
 
     /// The frames of these windows, as the model takes them.
-    pub fn stream<'a>(
+    pub(super) fn stream<'a>(
         &'a self,
         windows: &[Window],
         format: &'a ClipFormat,
-    ) -> Result<Stream<'a>, StageError> {
+    ) -> Result<Stream<'a>, ReconstructError> {
         let (chosen, decoded, clip) = match &self.frames {
             Frames::Clip(rgb) => (Vec::new(), None, Some(rgb)),
             Frames::Video { video, start } => {
@@ -246,9 +220,7 @@ impl Recording {
                 };
                 let chosen: Vec<Vec<usize>> = windows.iter().map(of).collect();
                 let threads = rayon::current_num_threads();
-                let decoded = video
-                    .squares(chosen.concat(), format.size as u32, threads)
-                    .map_err(|error| unreadable(&error))?;
+                let decoded = video.squares(chosen.concat(), format.size as u32, threads)?;
                 (chosen, Some(decoded), None)
             }
         };
@@ -268,21 +240,17 @@ impl Recording {
         network: &DepthLabeller,
         rate: f64,
         count: usize,
-    ) -> Result<Array3<f32>, StageError> {
-        let failed = |stop: Stop| match stop {
-            Stop::Label(error) => input(error, "see `anchor_model` in `reviv show reconstruct`"),
-            Stop::Read(error) => unreadable(&error),
-        };
+    ) -> Result<Array3<f32>, ReconstructError> {
         let (squares, of) = match &self.frames {
             Frames::Clip(rgb) => {
                 let images = rgb.frames.outer_iter().map(|frame| {
-                    Ok(Image {
+                    Ok::<_, ReconstructError>(Image {
                         width: frame.shape()[1] as u32,
                         height: frame.shape()[0] as u32,
                         data: frame.iter().copied().collect(),
                     })
                 });
-                let squares = anchor::labelled(network, images).map_err(failed)?;
+                let squares = anchor::labelled(network, images)?;
                 let last = squares.len() - 1;
                 (squares, (0..count).map(|k| k.min(last)).collect())
             }
@@ -292,36 +260,23 @@ impl Recording {
                 let mut own = chosen.clone();
                 own.sort_unstable();
                 own.dedup();
-                let decoded = video
-                    .chosen(own.clone())
-                    .map_err(|error| unreadable(&error))?;
-                let images = decoded.map(|frame| Ok(frame.map_err(Stop::Read)?.image));
-                let squares = anchor::labelled(network, images).map_err(failed)?;
+                let decoded = video.chosen(own.clone())?;
+                let images = decoded.map(|frame| Ok::<_, ReconstructError>(frame?.image));
+                let squares = anchor::labelled(network, images)?;
                 let last = squares.len() - 1;
                 let place = |frame: &usize| own.binary_search(frame).unwrap_or(last).min(last);
                 (squares, chosen.iter().map(place).collect::<Vec<usize>>())
             }
         };
         let views: Vec<_> = of.iter().map(|at| squares[*at].view()).collect();
-        ndarray::stack(Axis(0), &views).map_err(StageError::other)
-    }
-}
-
-/// What may end the labelling of an anchor.
-enum Stop {
-    Label(LabelError),
-    Read(ReadError),
-}
-
-impl From<LabelError> for Stop {
-    fn from(error: LabelError) -> Self {
-        Self::Label(error)
+        ndarray::stack(Axis(0), &views)
+            .map_err(|error| LabelError::Frames(error.to_string()).into())
     }
 }
 
 impl Stream<'_> {
     /// The frames of a window; windows are asked for in their order.
-    pub fn window(&mut self, index: usize) -> Result<Rgb, StageError> {
+    pub(super) fn window(&mut self, index: usize) -> Result<Rgb, ReconstructError> {
         if let Some(clip) = self.clip {
             return Ok(clip.clone());
         }
@@ -333,14 +288,8 @@ impl Stream<'_> {
         for (mut slot, wanted) in frames.outer_iter_mut().zip(chosen) {
             while !self.held.contains_key(wanted) {
                 let frame = self.decoded.as_mut().and_then(Iterator::next);
-                let (number, square) = frame
-                    .ok_or_else(|| {
-                        input(
-                            format_args!("the video ends before its frame {wanted}"),
-                            "check the file, or convert it with `ffmpeg`",
-                        )
-                    })?
-                    .map_err(|error| unreadable(&error))?;
+                let (number, square) =
+                    frame.ok_or(ReconstructError::Ends { before: *wanted })??;
                 self.held.insert(number, square);
             }
             slot.assign(&video::to_array(&self.held[wanted]));
@@ -383,20 +332,4 @@ fn said(settings: &LensSettings, lens: &Intrinsics) -> [Fact; 2] {
         fact("Intrinsics", format_args!("{}, {from}", words(lens))),
         fact("Up", up),
     ]
-}
-
-pub(super) fn input(message: impl Display, help: &str) -> StageError {
-    StageError::Input {
-        code: Code::E0601,
-        message: message.to_string(),
-        help: help.to_owned(),
-    }
-}
-
-fn unreadable(error: &ReadError) -> StageError {
-    input(error, "check the file, or convert it with `ffmpeg`")
-}
-
-fn lens(error: &LensError) -> StageError {
-    input(error, "correct `lens`")
 }
