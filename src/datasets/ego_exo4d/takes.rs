@@ -1,19 +1,20 @@
 //! `takes.json`: which takes there are, and where their files lie.
 
-use crate::formats::ReadError;
 use crate::formats::read_error::Position;
+use crate::formats::{ReadError, stays_inside};
 use serde::Deserialize;
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::BufReader;
 use std::ops::Range;
-use std::path::{Component, Path, PathBuf};
+use std::path::{Path, PathBuf};
 
 /// What is used of a take.
 #[derive(Debug, Clone, Deserialize)]
 pub(super) struct Take {
-    take_name: String,
+    #[serde(rename = "take_name")]
+    name: String,
     root_dir: Option<String>,
     capture_name: Option<String>,
     capture: Option<Capture>,
@@ -49,23 +50,17 @@ pub(super) fn read(path: &Path) -> Result<Vec<Take>, ReadError> {
     let takes: Vec<Take> =
         serde_json::from_reader(BufReader::with_capacity(1 << 16, file)).map_err(wrong)?;
     for take in &takes {
-        if !inside(&take.folder()) || !inside(Path::new(&take.capture())) {
-            let reason = format!("take `{}` lies outside of the data set", take.take_name);
+        if !stays_inside(&take.folder()) || !stays_inside(Path::new(&take.capture())) {
+            let reason = format!("take `{}` lies outside of the data set", take.name);
             return Err(ReadError::malformed(path, Position::File, reason));
         }
     }
     Ok(takes)
 }
 
-/// Whether a path from a file stays in the folder that it is appended to.
-fn inside(path: &Path) -> bool {
-    path.components()
-        .all(|part| matches!(part, Component::Normal(_) | Component::CurDir))
-}
-
 impl Take {
     pub fn name(&self) -> &str {
-        &self.take_name
+        &self.name
     }
 
     /// The data set has withdrawn it.
@@ -77,7 +72,7 @@ impl Take {
     pub fn folder(&self) -> PathBuf {
         match &self.root_dir {
             Some(folder) => PathBuf::from(folder),
-            None => Path::new("takes").join(&self.take_name),
+            None => Path::new("takes").join(&self.name),
         }
     }
 
@@ -90,7 +85,7 @@ impl Take {
         named
             .or_else(|| self.capture_name.clone())
             .unwrap_or_else(|| {
-                let name = self.take_name.as_str();
+                let name = self.name.as_str();
                 name.rsplit_once('_')
                     .map_or(name, |(front, _)| front)
                     .to_owned()
@@ -131,7 +126,7 @@ impl Take {
             .and_then(|stream| stream.get("relative_path"))
             .and_then(Value::as_str)
             .map(PathBuf::from)
-            .filter(|path| inside(path));
+            .filter(|path| stays_inside(path));
         let usual = PathBuf::from(format!("frame_aligned_videos/{camera}_214-1.mp4"));
         let small = PathBuf::from(format!(
             "frame_aligned_videos/downscaled/448/{camera}_214-1.mp4"
@@ -139,7 +134,7 @@ impl Take {
         [named, Some(usual), Some(small)]
             .into_iter()
             .flatten()
-            .filter(|path| inside(path))
+            .filter(|path| stays_inside(path))
             .map(|path| folder.join(path))
             .find(|path| path.is_file())
     }
@@ -154,7 +149,7 @@ impl Take {
         ]
         .into_iter()
         .flatten()
-        .filter(|path| inside(path))
+        .filter(|path| stays_inside(path))
         .map(|path| folder.join(path))
         .find(|path| path.is_file())
     }

@@ -121,8 +121,11 @@ fn position(row: &Row<'_>, first: usize) -> Result<Option<Point3<f64>>, ReadErro
     Ok(point.iter().all(|value| value.is_finite()).then_some(point))
 }
 
-/// Time, origin and unit direction of each ray that is known.
-pub(super) fn rays(path: &Path) -> Result<Vec<(i64, Point3<f64>, Vector3<f64>)>, ReadError> {
+/// Time, origin and unit direction of a ray.
+pub(super) type Ray = (i64, Point3<f64>, Vector3<f64>);
+
+/// The rays that are known.
+pub(super) fn rays(path: &Path) -> Result<Vec<Ray>, ReadError> {
     let mut rays = Vec::new();
     each_row(path, &|columns| matches!(columns, 8 | 9), |time, row| {
         row.tick(1)?;
