@@ -127,7 +127,8 @@ pub fn verify(root: &Path) -> Result<Verified, ReadError> {
         }
     }
     if let Some(tally) = &header.tally
-        && *tally != found.tally
+        && (tally.clips, &tally.dropped, &tally.damaged)
+            != (found.tally.clips, &found.tally.dropped, &found.tally.damaged)
     {
         found
             .problems

@@ -10,6 +10,7 @@ pub mod colour;
 pub mod embedded;
 pub mod ffmpeg;
 pub mod folder;
+pub mod grey16;
 pub mod h264;
 pub mod image;
 pub mod mp4;
