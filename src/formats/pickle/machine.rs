@@ -3,8 +3,8 @@
 use super::literal::{text_or_bytes, unescaped, unquoted};
 use super::objects::long;
 use super::{
-    CUT, Id, MAX_FILE_NODES, MAX_FILE_TEXT, MAX_LINE, MAX_NODES, MAX_SHORT, MAX_TEXT, Node, PickleError,
-    StoredBytes,
+    CUT, Id, MAX_FILE_NODES, MAX_FILE_TEXT, MAX_LINE, MAX_NODES, MAX_SHORT, MAX_TEXT, Node,
+    PickleError, StoredBytes,
 };
 use std::collections::BTreeMap;
 

@@ -65,7 +65,10 @@ impl Pickle {
                 let dtype = Dtype::from_code(&array.dtype).ok_or_else(|| {
                     format!("an array of type `{}` holds no numbers", array.dtype)
                 })?;
-                let count = array.shape.iter().try_fold(1usize, |n, &d| n.checked_mul(d));
+                let count = array
+                    .shape
+                    .iter()
+                    .try_fold(1usize, |n, &d| n.checked_mul(d));
                 let expected = count.and_then(|count| count.checked_mul(dtype.width()));
                 let there = match array.bytes.map(|bytes| self.node(bytes)) {
                     Some(Node::Bytes(bytes)) => Some(bytes.len()),
@@ -313,7 +316,9 @@ mod tests {
         );
         let wrong = file(&[&bytes[..at], b"K\x02", &bytes[at + 2..]].concat());
         let pickle = Pickle::open(wrong.path()).unwrap();
-        let error = pickle.numbers(pickle.get(pickle.root(), "a").unwrap()).unwrap_err();
+        let error = pickle
+            .numbers(pickle.get(pickle.root(), "a").unwrap())
+            .unwrap_err();
         assert!(error.contains("[2, 1000]"), "{error}");
     }
 }
