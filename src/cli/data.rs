@@ -253,8 +253,10 @@ fn write(
         Some(tally) => folder
             .finish(Tally { excluded, ..tally })
             .map_err(failure)?,
-        None => terminal.note("other shares are not finished yet
-"),
+        None => terminal.note(
+            "other shares are not finished yet
+",
+        ),
     }
     say(terminal, &converted, output, as_json);
     Ok(())

@@ -128,7 +128,11 @@ pub fn verify(root: &Path) -> Result<Verified, ReadError> {
     }
     if let Some(tally) = &header.tally
         && (tally.clips, &tally.dropped, &tally.damaged)
-            != (found.tally.clips, &found.tally.dropped, &found.tally.damaged)
+            != (
+                found.tally.clips,
+                &found.tally.dropped,
+                &found.tally.damaged,
+            )
     {
         found
             .problems
