@@ -6,7 +6,7 @@
 
 use reviv::clip::store::ClipSet;
 use reviv::datasets::aria::vrs::Vrs;
-use reviv::datasets::convert::{ConvertSettings, convert};
+use reviv::datasets::convert::{ConvertSettings, Share, convert};
 use reviv::datasets::recording::CutSettings;
 use reviv::datasets::shards::TarSink;
 use reviv::datasets::{ClipSource, mps};
@@ -182,7 +182,10 @@ fn shards_stream(bencher: divan::Bencher<'_, '_>) {
         clips_per_shard: 4,
         ..ConvertSettings::default()
     };
-    convert(&world, &sink, &settings, &mut |_| ControlFlow::Continue(())).expect("clips are made");
+    convert(&world, &sink, &settings, Share::WHOLE, &mut |_| {
+        ControlFlow::Continue(())
+    })
+    .expect("clips are made");
     let bytes: u64 = tars(folder.path()).iter().sum();
     let set = ClipSet::open(folder.path()).expect("the shards open");
     bencher

@@ -65,22 +65,34 @@ pub struct Expected {
 }
 
 /// Opens the recordings of a folder as clips.
-pub type Open = dyn Fn(&Path, &CutSettings) -> Result<Arc<dyn ClipSource>, ReadError>;
+pub type Open<'a> = dyn Fn(&Path, &CutSettings) -> Result<Arc<dyn ClipSource>, ReadError> + 'a;
 
 /// Compares every golden file in `folder` with the clips of its recording.
-pub fn check(folder: &Path, open: &Open, expected: &Expected, report: &mut Report) -> Outcome {
+pub fn check(folder: &Path, open: &Open<'_>, expected: &Expected, report: &mut Report) -> Outcome {
     for path in golden_files(folder)? {
-        let golden = Golden::read(&path)?;
-        if let Err(error) = one(folder, open, expected, &golden, report) {
-            report.problem(&golden.name, &error.to_string());
-        }
+        check_one(&path, folder, open, expected, report)?;
+    }
+    Ok(())
+}
+
+/// Compares one golden file with the clips of its recording in `folder`.
+pub fn check_one(
+    path: &Path,
+    folder: &Path,
+    open: &Open<'_>,
+    expected: &Expected,
+    report: &mut Report,
+) -> Outcome {
+    let golden = Golden::read(path)?;
+    if let Err(error) = one(folder, open, expected, &golden, report) {
+        report.problem(&golden.name, &error.to_string());
     }
     Ok(())
 }
 
 fn one(
     folder: &Path,
-    open: &Open,
+    open: &Open<'_>,
     expected: &Expected,
     golden: &Golden,
     report: &mut Report,

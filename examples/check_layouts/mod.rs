@@ -4,10 +4,15 @@ pub mod compare;
 pub mod golden;
 pub mod report;
 
+mod arctic;
 mod ego_exo4d;
 mod egogen;
+mod fake_mano;
+mod h2o;
 mod holoassist;
+mod hot3d_clips;
 mod nymeria;
+mod taco;
 
 use std::path::Path;
 
@@ -25,6 +30,11 @@ const SETS: &[(&str, Check)] = &[
     ("ego_exo4d", ego_exo4d::check),
     ("holoassist", holoassist::check),
     ("egogen", egogen::check),
+    ("fake_mano", fake_mano::check),
+    ("arctic", arctic::check),
+    ("taco", taco::check),
+    ("h2o", h2o::check),
+    ("hot3d_clips", hot3d_clips::check),
 ];
 
 /// Checks everything below `folder`: one known folder, or a set of them.

@@ -5,17 +5,20 @@ mod inspect;
 mod label_depth;
 mod status;
 mod synthesize;
+mod verify;
 
 use super::run::{interruptible, progress};
 use super::terminal::{Failure, Terminal};
-use crate::datasets::convert::{ConvertSettings, Converted, convert};
-use crate::datasets::open::{Dataset, OpenWith, open};
+use crate::datasets::convert::{ConvertSettings, Converted, Share, Tally, convert, whole};
+use crate::datasets::open::{Dataset, HandModel, OpenWith, open};
 use crate::datasets::recording::CutSettings;
 use crate::datasets::shards::{Folder, Header};
 use crate::datasets::{ClipSource, ReadError};
 use crate::experiment::catalog::Catalog;
+use crate::experiment::data::roots;
 use crate::experiment::load;
 use crate::experiment::registry::Registry;
+use crate::experiment::source::Sources;
 use crate::formats::text::of_path;
 use crate::ops::clips::SourceSettings;
 use crate::video::DecoderChoice;
@@ -38,6 +41,7 @@ enum Command {
     Convert(convert::Convert),
     LabelDepth(label_depth::LabelDepth),
     Synthesize(synthesize::Synthesize),
+    Verify(verify::Verify),
 }
 
 impl super::Run for Data {
@@ -48,6 +52,7 @@ impl super::Run for Data {
             Command::Convert(command) => command.run(terminal),
             Command::LabelDepth(command) => command.run(terminal),
             Command::Synthesize(command) => command.run(terminal),
+            Command::Verify(command) => command.run(terminal),
         }
     }
 }
@@ -55,7 +60,8 @@ impl super::Run for Data {
 /// How clips are cut from recordings.
 #[derive(Debug, Clone, clap::Args)]
 struct Cut {
-    /// What lies there: adt, hot3d_aria, hot3d_quest, nymeria, ego_exo4d, holoassist, egogen, aria, neutral, egom2p, video or shards; else what it
+    /// What lies there: adt, hot3d_aria, hot3d_quest, hot3d_clips, nymeria, ego_exo4d, holoassist, arctic, taco, h2o, egogen, aria, neutral,
+    /// egom2p, video or shards; else what it
     /// looks like
     #[arg(long, value_name = "KIND", value_parser = kind)]
     kind: Option<Dataset>,
@@ -71,6 +77,12 @@ struct Cut {
     /// Seconds from the start of one clip to the start of the next
     #[arg(long, default_value_t = 2.0, value_name = "SECONDS")]
     stride: f64,
+    /// The folder of MANO_LEFT.pkl and MANO_RIGHT.pkl, for sets whose hands are MANO parameters [default: `mano` of data.yaml]
+    #[arg(long, value_name = "DIR")]
+    mano: Option<PathBuf>,
+    /// Where a data set has the parameters of two models of a hand: auto, umetrack or mano
+    #[arg(long, default_value = "auto", value_name = "MODEL", value_parser = hand_model)]
+    hands: HandModel,
     /// Take a recording shorter than a clip as one clip: the last frame is repeated, signals after the end are invalid
     #[arg(long)]
     pad_short: bool,
@@ -82,6 +94,24 @@ struct Cut {
 fn kind(text: &str) -> Result<Dataset, String> {
     let names = Dataset::ALL.map(Dataset::name).join(", ");
     Dataset::from_name(text).ok_or_else(|| format!("not one of {names}"))
+}
+
+fn hand_model(text: &str) -> Result<HandModel, String> {
+    serde_json::from_value(text.into()).map_err(|_| "not one of auto, umetrack, mano".to_owned())
+}
+
+/// The folder of a name in `data.yaml` of this folder, or in the environment.
+fn data_root(name: &str) -> Option<PathBuf> {
+    let environment = std::env::vars_os()
+        .filter_map(|(name, value)| Some((name.into_string().ok()?, value.into_string().ok()?)))
+        .collect();
+    let roots = roots(
+        Path::new("./x"),
+        &environment,
+        &mut Sources::default(),
+        &mut Vec::new(),
+    );
+    roots.get(name).map(|root| root.path.clone())
 }
 
 impl Cut {
@@ -99,7 +129,16 @@ impl Cut {
 
     fn open(&self, path: &Path, settings: &CutSettings) -> Result<Arc<dyn ClipSource>, Failure> {
         settings.check().map_err(failure)?;
-        open(path, self.kind, settings, OpenWith::default()).map_err(failure)
+        let mano = self.mano.clone().or_else(|| {
+            let needed = HandModel::may_need_mano(self.kind);
+            needed.then(|| data_root("mano")).flatten()
+        });
+        let with = OpenWith {
+            mano: mano.as_deref(),
+            hands: self.hands,
+            ..OpenWith::default()
+        };
+        open(path, self.kind, settings, with).map_err(failure)
     }
 }
 
@@ -162,6 +201,7 @@ fn write(
     source: &dyn ClipSource,
     request: serde_json::Value,
     settings: &ConvertSettings,
+    share: Share,
     output: &Path,
     as_json: bool,
 ) -> Result<(), Failure> {
@@ -188,7 +228,7 @@ fn write(
     let interrupt = interruptible(terminal)?;
     let progress = progress(terminal);
     let mut task = progress.task("clips");
-    let converted = convert(source, &sink, settings, &mut |now| {
+    let converted = convert(source, &sink, settings, share, &mut |now| {
         task.update(now.done as u64, now.total as u64, "clips");
         if interrupt.requested() {
             return ControlFlow::Break(());
@@ -202,10 +242,27 @@ fn write(
         terminal.note("interrupted; give the same command again and it continues\n");
         return Err(Failure::Ended(130));
     }
+    let excluded: Vec<String> = source.excluded().into_iter().map(|e| e.reason).collect();
     let mut tally = converted.tally.clone();
-    tally.excluded = source.excluded().into_iter().map(|e| e.reason).collect();
+    tally.excluded.clone_from(&excluded);
     let converted = Converted { tally, ..converted };
-    folder.finish(converted.tally.clone()).map_err(failure)?;
+    // The process that ends last sums up.
+    match whole(source.len(), &sink, settings) {
+        Some(tally) if tally.clips == 0 => {
+            say(terminal, &converted, output, as_json);
+            return Err(Failure::input(
+                "not one clip came out of it",
+                "the lines above say why",
+            ));
+        }
+        Some(tally) => folder
+            .finish(Tally { excluded, ..tally })
+            .map_err(failure)?,
+        None => terminal.note(
+            "other shares are not finished yet
+",
+        ),
+    }
     say(terminal, &converted, output, as_json);
     Ok(())
 }

@@ -31,6 +31,53 @@ impl Default for ConvertSettings {
     }
 }
 
+/// The part of one of several processes that share a conversion: each makes every `of`-th shard, so that all of them end at about
+/// the same time.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Share {
+    /// From 0.
+    index: usize,
+    of: usize,
+}
+
+impl Share {
+    /// Everything.
+    pub const WHOLE: Share = Share { index: 0, of: 1 };
+
+    /// Whether a shard belongs to this part.
+    #[must_use]
+    pub fn has(self, shard: usize) -> bool {
+        shard % self.of == self.index
+    }
+}
+
+impl std::str::FromStr for Share {
+    type Err = String;
+
+    /// `2/8` is the second of eight.
+    fn from_str(text: &str) -> Result<Self, String> {
+        let parts = text.split_once('/');
+        let parts = parts.and_then(|(index, of)| Some((index.parse().ok()?, of.parse().ok()?)));
+        match parts {
+            Some((index, of)) if (1..=of).contains(&index) => Ok(Share {
+                index: index - 1,
+                of,
+            }),
+            _ => Err("not a part such as 1/8, 2/8 ... 8/8".to_owned()),
+        }
+    }
+}
+
+/// What became of all clips, once every shard of a conversion is finished, whichever process made it.
+#[must_use]
+pub fn whole(clips: usize, sink: &dyn ShardSink, settings: &ConvertSettings) -> Option<Tally> {
+    let mut tally = Tally::default();
+    for shard in 0..clips.div_ceil(settings.clips_per_shard.max(1)) {
+        tally.add(&sink.finished(shard)?);
+    }
+    Some(tally)
+}
+
 /// Where shards go.
 pub trait ShardSink {
     /// What a finished shard of an earlier attempt holds; `None` when it has to be made.
@@ -126,7 +173,7 @@ pub struct Converted {
     pub interrupted: bool,
 }
 
-/// Converts all clips of `source`. `watch` hears of every clip on the calling thread and may stop the work.
+/// Converts the clips of `source` that fall into this process's share. `watch` hears of every clip on the calling thread and may stop the work.
 ///
 /// # Errors
 /// The first one met; shards that are finished stay, and calling again goes on from there.
@@ -134,21 +181,27 @@ pub fn convert(
     source: &dyn ClipSource,
     sink: &dyn ShardSink,
     settings: &ConvertSettings,
+    share: Share,
     watch: &mut dyn FnMut(&Progress) -> ControlFlow<()>,
 ) -> Result<Converted, ReadError> {
     if settings.clips_per_shard == 0 {
         return Err(ReadError::Settings("`clips_per_shard` is 0".to_owned()));
     }
-    let total = source.len();
-    let shards = total.div_ceil(settings.clips_per_shard);
+    let clips = source.len();
+    let shards: Vec<usize> = (0..clips.div_ceil(settings.clips_per_shard))
+        .filter(|shard| share.has(*shard))
+        .collect();
     let range = |shard: usize| {
         let first = shard * settings.clips_per_shard;
-        first..(first + settings.clips_per_shard).min(total)
+        first..(first + settings.clips_per_shard).min(clips)
     };
-    let finished: Vec<Option<Tally>> = (0..shards).map(|shard| sink.finished(shard)).collect();
-    let todo: Vec<usize> = (0..shards)
-        .filter(|shard| finished[*shard].is_none())
-        .flat_map(range)
+    let total = shards.iter().map(|shard| range(*shard).len()).sum();
+    let finished: Vec<Option<Tally>> = shards.iter().map(|shard| sink.finished(*shard)).collect();
+    let todo: Vec<usize> = shards
+        .iter()
+        .zip(&finished)
+        .filter(|(_, finished)| finished.is_none())
+        .flat_map(|(shard, _)| range(*shard))
         .collect();
     let threads = rayon::current_num_threads();
     in_order(
@@ -164,13 +217,13 @@ pub fn convert(
         },
         |outcomes| {
             let mut converted = Converted {
-                shards,
+                shards: shards.len(),
                 reused: 0,
                 tally: Tally::default(),
                 interrupted: false,
             };
             let mut done = 0;
-            for (shard, finished) in finished.iter().enumerate() {
+            for (&shard, finished) in shards.iter().zip(&finished) {
                 let count = range(shard).len();
                 if let Some(tally) = finished {
                     done += count;
@@ -314,7 +367,7 @@ mod tests {
             skip_damaged: true,
         };
         let mut seen = 0;
-        let converted = convert(&Numbers, &sink, &settings, &mut |progress| {
+        let converted = convert(&Numbers, &sink, &settings, Share::WHOLE, &mut |progress| {
             assert_eq!((progress.total, progress.done), (25, seen + 1));
             seen = progress.done;
             ControlFlow::Continue(())
@@ -335,7 +388,7 @@ mod tests {
         // Again: everything is there already, and the sums are the same.
         sink.0.lock().unwrap().remove(&1);
         let go = &mut |_: &Progress| ControlFlow::Continue(());
-        let again = convert(&Numbers, &sink, &settings, go).unwrap();
+        let again = convert(&Numbers, &sink, &settings, Share::WHOLE, go).unwrap();
         assert_eq!((again.reused, &again.tally.clips), (2, &19));
         assert_eq!(again.tally.dropped, converted.tally.dropped);
     }
@@ -346,6 +399,7 @@ mod tests {
             &Numbers,
             &Memory::default(),
             &ConvertSettings::default(),
+            Share::WHOLE,
             &mut |_| ControlFlow::Continue(()),
         );
         assert!(result.unwrap_err().to_string().contains("13"));
@@ -364,7 +418,7 @@ mod tests {
             }
             ControlFlow::Continue(())
         };
-        let converted = convert(&Numbers, &sink, &settings, &mut stop).unwrap();
+        let converted = convert(&Numbers, &sink, &settings, Share::WHOLE, &mut stop).unwrap();
         assert!(converted.interrupted);
         for (ids, tally) in sink.0.lock().unwrap().values() {
             assert_eq!(ids.len(), tally.clips);
@@ -372,10 +426,34 @@ mod tests {
         }
         assert_eq!(sink.0.lock().unwrap().len(), 1);
         let go = &mut |_: &Progress| ControlFlow::Continue(());
-        let rest = convert(&Numbers, &sink, &settings, go).unwrap();
+        let rest = convert(&Numbers, &sink, &settings, Share::WHOLE, go).unwrap();
         assert_eq!(
             (rest.interrupted, rest.tally.clips, rest.reused),
             (false, 19, 1)
         );
+    }
+
+    #[test]
+    fn shares_make_each_shard_once_and_together_everything() {
+        let (sink, alone) = (Memory::default(), Memory::default());
+        let settings = ConvertSettings {
+            clips_per_shard: 4,
+            skip_damaged: true,
+        };
+        let go = &mut |_: &Progress| ControlFlow::Continue(());
+        let all = convert(&Numbers, &alone, &settings, Share::WHOLE, go).unwrap();
+        let mut made = 0;
+        for part in ["3/3", "1/3", "2/3"] {
+            assert_eq!(whole(25, &sink, &settings), None);
+            let part = convert(&Numbers, &sink, &settings, part.parse().unwrap(), go).unwrap();
+            assert_eq!(part.reused, 0);
+            made += part.shards;
+        }
+        assert_eq!(made, all.shards);
+        assert_eq!(whole(25, &sink, &settings), Some(all.tally));
+        assert_eq!(*sink.0.lock().unwrap(), *alone.0.lock().unwrap());
+        for wrong in ["0/3", "4/3", "1", "a/b", "1/0"] {
+            assert!(wrong.parse::<Share>().is_err(), "{wrong}");
+        }
     }
 }

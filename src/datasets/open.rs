@@ -4,8 +4,8 @@ use super::recording::{ColourFrames, CutSettings, Recording};
 use super::shards::ShardClips;
 use super::track::SECOND;
 use super::{
-    ClipSource, Outcome, ReadError, adt, ego_exo4d, egogen, egom2p, holoassist, hot3d, mps,
-    neutral, nymeria,
+    ClipSource, Outcome, ReadError, adt, arctic, ego_exo4d, egogen, egom2p, h2o, holoassist, hot3d,
+    hot3d_clips, mps, neutral, nymeria, taco,
 };
 use crate::modality::{ClipFormat, DeclaredSettings};
 use crate::video::image::Image;
@@ -29,8 +29,16 @@ pub enum Dataset {
     Nymeria,
     /// Ego-Exo4D takes.
     EgoExo4d,
+    /// Clips of HOT3D in tars, from Aria glasses and Quest 3 headsets.
+    Hot3dClips,
     /// HoloAssist sessions.
     Holoassist,
+    /// ARCTIC sequences, the head camera.
+    Arctic,
+    /// TACO sequences, the head camera.
+    Taco,
+    /// H2O recordings, the helmet camera.
+    H2o,
     /// EgoGen as EgoM2P stores it.
     Egogen,
     /// Aria recordings with the files of Machine Perception Services.
@@ -47,7 +55,7 @@ pub enum Dataset {
 
 impl Dataset {
     /// Every kind, in the order in which a path is tried.
-    pub const ALL: [Dataset; 12] = [
+    pub const ALL: [Dataset; 16] = [
         Dataset::Shards,
         Dataset::Neutral,
         Dataset::Adt,
@@ -55,7 +63,11 @@ impl Dataset {
         Dataset::Hot3dQuest,
         Dataset::Nymeria,
         Dataset::EgoExo4d,
+        Dataset::Hot3dClips,
         Dataset::Holoassist,
+        Dataset::Arctic,
+        Dataset::Taco,
+        Dataset::H2o,
         Dataset::Egogen,
         Dataset::Aria,
         Dataset::Egom2p,
@@ -71,7 +83,11 @@ impl Dataset {
             Dataset::Hot3dQuest => "hot3d_quest",
             Dataset::Nymeria => "nymeria",
             Dataset::EgoExo4d => "ego_exo4d",
+            Dataset::Hot3dClips => "hot3d_clips",
             Dataset::Holoassist => "holoassist",
+            Dataset::Arctic => "arctic",
+            Dataset::Taco => "taco",
+            Dataset::H2o => "h2o",
             Dataset::Egogen => "egogen",
             Dataset::Aria => "aria",
             Dataset::Shards => "shards",
@@ -88,6 +104,41 @@ impl Dataset {
     }
 }
 
+/// Which model gives a hand its joints, where a data set has the parameters of both.
+#[derive(
+    Debug,
+    Clone,
+    Copy,
+    PartialEq,
+    Eq,
+    Default,
+    serde::Serialize,
+    serde::Deserialize,
+    schemars::JsonSchema,
+)]
+#[serde(rename_all = "snake_case")]
+pub enum HandModel {
+    /// UmeTrack where the wearer's profile is there, else MANO.
+    #[default]
+    Auto,
+    Umetrack,
+    Mano,
+}
+
+impl HandModel {
+    /// Whether recordings of this kind may need the user's MANO models.
+    #[must_use]
+    pub fn may_need_mano(dataset: Option<Dataset>) -> bool {
+        match dataset {
+            None => true,
+            Some(dataset) => matches!(
+                dataset,
+                Dataset::Hot3dClips | Dataset::Arctic | Dataset::Taco | Dataset::H2o
+            ),
+        }
+    }
+}
+
 /// What a data set is opened with besides its own files.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct OpenWith<'a> {
@@ -95,6 +146,7 @@ pub struct OpenWith<'a> {
     pub declared: &'a [DeclaredSettings],
     /// The folder of the user's `MANO_LEFT.pkl` and `MANO_RIGHT.pkl`, for sets whose hands are MANO parameters.
     pub mano: Option<&'a Path>,
+    pub hands: HandModel,
 }
 
 /// Opens `path` as this kind of data set; without a kind, as the first kind that finds its recordings there.
@@ -124,8 +176,12 @@ pub fn open(
         ));
     };
     let (settings, declared) = (settings.clone(), with.declared);
-    // A file is a video, whatever is asked.
-    if path.is_file() && kind != Dataset::Video {
+    // A file is a video or a clip in a tar, whatever is asked.
+    let may_be_file = match kind {
+        Dataset::Video => !hot3d_clips::is_clip(path),
+        kind => kind == Dataset::Hot3dClips,
+    };
+    if path.is_file() && !may_be_file {
         return Err(ReadError::absent(
             path,
             "a file, not a folder of recordings",
@@ -140,6 +196,12 @@ pub fn open(
         Dataset::Holoassist => {
             Arc::new(holoassist::source(path, settings)?.with_declared(declared))
         }
+        Dataset::Hot3dClips => {
+            Arc::new(hot3d_clips::source(path, settings, with.mano, with.hands)?)
+        }
+        Dataset::Arctic => Arc::new(arctic::source(path, settings, with.mano)?),
+        Dataset::Taco => Arc::new(taco::source(path, settings, with.mano)?),
+        Dataset::H2o => Arc::new(h2o::source(path, settings, with.mano)?.with_declared(declared)),
         Dataset::Egogen => Arc::new(egogen::source(path, settings)?.with_declared(declared)),
         Dataset::Aria => Arc::new(mps::source(path, settings)?.with_declared(declared)),
         Dataset::Neutral => Arc::new(neutral::source(path, settings)?.with_declared(declared)),

@@ -59,6 +59,21 @@ pub trait DepthFrames: Send + Sync {
     /// # Errors
     /// When it cannot be read.
     fn read(&self, index: usize) -> Result<Array2<f32>, ReadError>;
+
+    /// Several, by ascending, distinct indices, one at a time: for files in which one is as dear as many.
+    ///
+    /// # Errors
+    /// When one cannot be read.
+    fn read_several(
+        &self,
+        indices: &[usize],
+        each: &mut dyn FnMut(Array2<f32>),
+    ) -> Result<(), ReadError> {
+        for &index in indices {
+            each(self.read(index)?);
+        }
+        Ok(())
+    }
 }
 
 /// A camera on the device, over time.

@@ -13,6 +13,7 @@ use crate::formats::text::read_json;
 use crate::formats::write_atomically;
 use crate::modality::ClipFormat;
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
@@ -63,6 +64,68 @@ impl From<ShardError> for ReadError {
     }
 }
 
+/// What the marker of a finished shard says.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Marker {
+    pub tally: Tally,
+    /// The shard's files below the root, by path.
+    pub files: BTreeMap<String, Content>,
+}
+
+/// What a file held when it was written.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Content {
+    pub bytes: u64,
+    pub blake3: String,
+}
+
+impl Content {
+    /// Reads a file to its end.
+    ///
+    /// # Errors
+    /// When it cannot be read.
+    pub fn of(path: &Path) -> Result<Self, ReadError> {
+        let fail = |cause| ReadError::io(path, cause);
+        let mut hasher = blake3::Hasher::new();
+        let mut file = std::fs::File::open(path).map_err(fail)?;
+        let bytes = std::io::copy(&mut file, &mut hasher).map_err(fail)?;
+        Ok(Content {
+            bytes,
+            blake3: hasher.finalize().to_hex().to_string(),
+        })
+    }
+}
+
+/// The tars of every modality and data set below a folder, by path from there: `rgb/adt/shard-000003.tar`.
+pub(super) fn tars(root: &Path) -> Result<Vec<String>, ReadError> {
+    fn descend(
+        root: &Path,
+        folder: &Path,
+        depth: usize,
+        found: &mut Vec<String>,
+    ) -> Result<(), ReadError> {
+        let fail = |cause| ReadError::io(folder, cause);
+        for entry in std::fs::read_dir(folder).map_err(fail)? {
+            let path = entry.map_err(fail)?.path();
+            if path.is_dir() {
+                if depth > 0 {
+                    descend(root, &path, depth - 1, found)?;
+                }
+            } else if path.extension().is_some_and(|extension| extension == "tar") {
+                let inside = path.strip_prefix(root).unwrap_or(&path);
+                found.push(inside.to_string_lossy().into_owned());
+            }
+        }
+        Ok(())
+    }
+    let mut found = Vec::new();
+    descend(root, root, 2, &mut found)?;
+    found.sort();
+    Ok(found)
+}
+
 /// Writes shards below a folder; a marker beside them says that one is finished.
 #[derive(Debug, Clone)]
 pub struct TarSink {
@@ -88,11 +151,24 @@ impl TarSink {
     fn marker(&self, shard: usize) -> PathBuf {
         self.markers.join(format!("shard-{shard:06}.json"))
     }
+
+    /// What is known of a finished shard; `None` when it has to be made.
+    #[must_use]
+    pub fn read_marker(&self, shard: usize) -> Option<Marker> {
+        let bytes = std::fs::read(self.marker(shard)).ok()?;
+        // Markers of version 1 were the tally alone.
+        serde_json::from_slice(&bytes).ok().or_else(|| {
+            Some(Marker {
+                tally: serde_json::from_slice(&bytes).ok()?,
+                files: BTreeMap::new(),
+            })
+        })
+    }
 }
 
 impl ShardSink for TarSink {
     fn finished(&self, shard: usize) -> Option<Tally> {
-        serde_json::from_slice(&std::fs::read(self.marker(shard)).ok()?).ok()
+        Some(self.read_marker(shard)?.tally)
     }
 
     fn write(
@@ -102,7 +178,19 @@ impl ShardSink for TarSink {
         tally: &dyn Fn() -> Tally,
     ) -> Result<(), ReadError> {
         store::write_clips(&self.root, shard as u32, clips)?;
-        write_json(&self.marker(shard), &tally())
+        let name = format!("shard-{shard:06}.tar");
+        let mut files = BTreeMap::new();
+        for file in tars(&self.root)? {
+            if Path::new(&file)
+                .file_name()
+                .is_some_and(|found| found == name.as_str())
+            {
+                let content = Content::of(&self.root.join(&file))?;
+                files.insert(file, content);
+            }
+        }
+        let tally = tally();
+        write_json(&self.marker(shard), &Marker { tally, files })
     }
 }
 
@@ -146,6 +234,10 @@ impl Folder {
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => {
                 let empty =
                     std::fs::read_dir(root).map_or(true, |mut inside| inside.next().is_none());
+                // Another process with a share of the same conversion may have begun in between.
+                if !empty && file.is_file() {
+                    return Self::begin(root, header);
+                }
                 if !empty {
                     let reason = "is not empty and holds no converted clips; name another folder";
                     return Err(ReadError::unsupported(root, reason));
@@ -167,6 +259,19 @@ impl Folder {
     /// When the disk refuses.
     pub fn sink(&self) -> Result<TarSink, ReadError> {
         TarSink::new(&self.root, &self.root.join(".finished"))
+    }
+
+    /// The header as it lies there.
+    ///
+    /// # Errors
+    /// When there is none, or it is damaged.
+    pub fn header(root: &Path) -> Result<Header, ReadError> {
+        let file = root.join(FILE);
+        let bytes = std::fs::read(&file).map_err(|cause| ReadError::io(&file, cause))?;
+        serde_json::from_slice(&bytes).map_err(|error| {
+            let line = Position::Line(error.line() as u64);
+            ReadError::malformed(&file, line, error.to_string())
+        })
     }
 
     /// Writes what became of it.

@@ -16,7 +16,7 @@ const FINGERS: usize = 5;
 /// Wrist twice, then three moving frames of each finger.
 const FRAMES: usize = 2 + 3 * FINGERS;
 /// Joint angles that the kinematics use.
-const ANGLES: usize = 4 * FINGERS;
+pub const ANGLES: usize = 4 * FINGERS;
 
 /// The shape of a user's hand.
 #[derive(Debug, Clone, PartialEq)]
@@ -57,6 +57,15 @@ impl HandProfile {
         Self::from_model(&file.hand_model).map_err(|reason| {
             ReadError::malformed(path, Position::File, format!("hand_model: {reason}"))
         })
+    }
+
+    /// From the hand model itself, as HOT3D-Clips has it.
+    ///
+    /// # Errors
+    /// A sentence about the part that is no hand.
+    pub fn from_json(model: &serde_json::Value) -> Result<Self, String> {
+        let model = HandModel::deserialize(model).map_err(|error| error.to_string())?;
+        Self::from_model(&model)
     }
 
     fn from_model(model: &HandModel) -> Result<Self, String> {

@@ -6,8 +6,13 @@ use super::problem::Code;
 use super::stage::{DataInput, FileInput};
 use std::collections::BTreeMap;
 
-/// The data sets of a stage with the folders they lie in; none where nothing says so, or where no folder is.
-pub fn data(asked: Vec<(String, String)>, roots: &BTreeMap<String, DataRoot>) -> Vec<DataInput> {
+/// The data sets of a stage with the folders they lie in; none where nothing says so, or where no folder is. Optional ones that are
+/// not there are not inputs.
+pub fn data(
+    asked: Vec<(String, String)>,
+    optional: Vec<(String, String)>,
+    roots: &BTreeMap<String, DataRoot>,
+) -> Vec<DataInput> {
     let found = |(name, key): (String, String)| {
         let root = roots.get(&name).filter(|root| root.path.is_dir());
         DataInput {
@@ -16,7 +21,9 @@ pub fn data(asked: Vec<(String, String)>, roots: &BTreeMap<String, DataRoot>) ->
             key,
         }
     };
-    asked.into_iter().map(found).collect()
+    let optional = optional.into_iter().map(found);
+    let there = optional.filter(|data| data.path.is_some());
+    asked.into_iter().map(found).chain(there).collect()
 }
 
 /// Says that a file is not there.

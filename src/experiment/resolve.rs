@@ -168,7 +168,11 @@ impl Resolver<'_> {
             name: draft.name,
             op: draft.op,
             files: draft.op.files(&settings),
-            data: external_inputs::data(draft.op.data(&settings), self.data),
+            data: external_inputs::data(
+                draft.op.data(&settings),
+                draft.op.optional_data(&settings),
+                self.data,
+            ),
             settings,
             seed: draft.seed,
             edges,

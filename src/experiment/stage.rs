@@ -172,6 +172,11 @@ pub trait Op: Send + Sync + 'static {
         Vec::new()
     }
 
+    /// Data sets that it reads where they are there and does without where they are not.
+    fn optional_data(&self, _settings: &Self::Settings) -> Vec<(String, String)> {
+        Vec::new()
+    }
+
     /// Reports everything wrong that types and ranges do not catch, and describes the output. No compute, no files.
     fn check(
         &self,
@@ -209,6 +214,7 @@ pub trait AnyOp: Send + Sync + 'static {
     fn normalize(&self, settings: Value) -> Result<Value, serde_json::Error>;
     fn files(&self, settings: &Value) -> Vec<FileInput>;
     fn data(&self, settings: &Value) -> Vec<(String, String)>;
+    fn optional_data(&self, settings: &Value) -> Vec<(String, String)>;
     fn check(
         &self,
         settings: &Value,
@@ -253,6 +259,9 @@ impl<O: Op> AnyOp for O {
     }
     fn data(&self, settings: &Value) -> Vec<(String, String)> {
         typed::<O>(settings).map_or_else(|_| Vec::new(), |s| Op::data(self, &s))
+    }
+    fn optional_data(&self, settings: &Value) -> Vec<(String, String)> {
+        typed::<O>(settings).map_or_else(|_| Vec::new(), |s| Op::optional_data(self, &s))
     }
     fn check(
         &self,

@@ -1,8 +1,9 @@
 //! Camera models: how a point in front of a camera becomes a pixel, and back.
 //!
-//! Axes are `OpenCV`'s (x right, y down, z forward); the centre of the top-left pixel is (0, 0). Three models cover head-mounted
+//! Axes are `OpenCV`'s (x right, y down, z forward); the centre of the top-left pixel is (0, 0). Three models cover most head-mounted
 //! recordings: the pinhole, Project Aria's and Quest's Fisheye624 (radial, tangential and thin-prism terms; the "FisheyeRadTanThinPrism"
-//! of the public `projectaria_tools`) and Kannala-Brandt with four radial terms (`OpenCV`'s fisheye, GoPro calibrations).
+//! of the public `projectaria_tools`) and Kannala-Brandt with four radial terms (`OpenCV`'s fisheye, GoPro calibrations). A fourth,
+//! `OpenCV`'s rational model, is for wide pinhole lenses (ARCTIC).
 
 use nalgebra::{Matrix2, Vector2, Vector3};
 
@@ -29,6 +30,7 @@ pub enum Lens {
     Pinhole(Pinhole),
     Fisheye624(Fisheye624),
     KannalaBrandt(KannalaBrandt),
+    Rational(Rational),
 }
 
 /// `u = fx x/z + cx`, `v = fy y/z + cy`.
@@ -62,6 +64,17 @@ pub struct KannalaBrandt {
     pub radial: [f64; 4],
 }
 
+/// `OpenCV`'s eight distortion terms `k1 k2 p1 p2 k3 k4 k5 k6` around a pinhole.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Rational {
+    pub fx: f64,
+    pub fy: f64,
+    pub cx: f64,
+    pub cy: f64,
+    /// In `OpenCV`'s order.
+    pub distortion: [f64; 8],
+}
+
 impl Camera {
     /// The pixel of a point in the camera frame. `None` where the model does not reach: behind the camera, or not finite.
     /// The pixel may lie outside of the image; [`Camera::sees`] tells.
@@ -71,6 +84,7 @@ impl Camera {
             Lens::Pinhole(lens) => lens.project(point),
             Lens::Fisheye624(lens) => lens.project(point),
             Lens::KannalaBrandt(lens) => lens.project(point),
+            Lens::Rational(lens) => lens.project(point),
         }?;
         (pixel.x.is_finite() && pixel.y.is_finite()).then_some(pixel)
     }
@@ -82,6 +96,7 @@ impl Camera {
             Lens::Pinhole(lens) => Some(lens.unproject(pixel)),
             Lens::Fisheye624(lens) => lens.unproject(pixel),
             Lens::KannalaBrandt(lens) => lens.unproject(pixel),
+            Lens::Rational(lens) => lens.unproject(pixel),
         }?;
         (ray.x.is_finite() && ray.y.is_finite()).then_some(ray)
     }
@@ -138,11 +153,32 @@ impl Camera {
             fisheye.tangential = [-p1, p0];
             fisheye.prism = [-s2, -s3, s0, s1];
         }
+        if let Lens::Rational(rational) = &mut lens {
+            let [_, _, p1, p2, ..] = rational.distortion;
+            rational.distortion[2..4].copy_from_slice(&[p2, -p1]);
+        }
         Camera {
             lens,
             width: self.height,
             height: self.width,
             valid_radius: self.valid_radius,
+        }
+    }
+
+    /// The camera of the image resized to `width` x `height`.
+    #[must_use]
+    pub fn resized_to(&self, width: u32, height: u32) -> Camera {
+        let x = f64::from(width) / f64::from(self.width);
+        let y = f64::from(height) / f64::from(self.height);
+        let mut lens = self.lens.clone();
+        lens.map_linear(|fx, fy, cx, cy| {
+            (fx * x, fy * y, x * (cx + 0.5) - 0.5, y * (cy + 0.5) - 0.5)
+        });
+        Camera {
+            lens,
+            width,
+            height,
+            valid_radius: self.valid_radius.map(|radius| radius * x.min(y)),
         }
     }
 
@@ -166,7 +202,8 @@ impl Lens {
         match *self {
             Lens::Pinhole(Pinhole { fx, fy, cx, cy })
             | Lens::Fisheye624(Fisheye624 { fx, fy, cx, cy, .. })
-            | Lens::KannalaBrandt(KannalaBrandt { fx, fy, cx, cy, .. }) => (fx, fy, cx, cy),
+            | Lens::KannalaBrandt(KannalaBrandt { fx, fy, cx, cy, .. })
+            | Lens::Rational(Rational { fx, fy, cx, cy, .. }) => (fx, fy, cx, cy),
         }
     }
 
@@ -174,7 +211,8 @@ impl Lens {
         match self {
             Lens::Pinhole(Pinhole { fx, fy, cx, cy })
             | Lens::Fisheye624(Fisheye624 { fx, fy, cx, cy, .. })
-            | Lens::KannalaBrandt(KannalaBrandt { fx, fy, cx, cy, .. }) => {
+            | Lens::KannalaBrandt(KannalaBrandt { fx, fy, cx, cy, .. })
+            | Lens::Rational(Rational { fx, fy, cx, cy, .. }) => {
                 (*fx, *fy, *cx, *cy) = change(*fx, *fy, *cx, *cy);
             }
         }
@@ -312,6 +350,59 @@ impl KannalaBrandt {
         }
         let theta = invert_angle(radius, |theta| radial(&self.radial, theta))?;
         ray_at(theta, &(q / radius))
+    }
+}
+
+impl Rational {
+    /// The distorted point of a point on the plane z = 1, and the derivative.
+    fn distorted(&self, p: &Vector2<f64>) -> (Vector2<f64>, Matrix2<f64>) {
+        let [k1, k2, p1, p2, k3, k4, k5, k6] = self.distortion;
+        let r2 = p.norm_squared();
+        let above = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3));
+        let below = 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6));
+        let radial = above / below;
+        // d(radial)/d(r2)
+        let slope = ((k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3)) * below
+            - above * (k4 + r2 * (2.0 * k5 + 3.0 * r2 * k6)))
+            / (below * below);
+        let (x, y) = (p.x, p.y);
+        let value = Vector2::new(
+            x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
+            y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
+        );
+        let cross = 2.0 * x * y * slope + 2.0 * p1 * x + 2.0 * p2 * y;
+        let jacobian = Matrix2::new(
+            radial + 2.0 * x * x * slope + 2.0 * p1 * y + 6.0 * p2 * x,
+            cross,
+            cross,
+            radial + 2.0 * y * y * slope + 6.0 * p1 * y + 2.0 * p2 * x,
+        );
+        (value, jacobian)
+    }
+
+    fn project(&self, p: &Vector3<f64>) -> Option<Vector2<f64>> {
+        if p.z <= 0.0 {
+            return None;
+        }
+        let (d, jacobian) = self.distorted(&Vector2::new(p.x / p.z, p.y / p.z));
+        // Beyond where the polynomials turn back, pixels mean nothing.
+        (jacobian.determinant() > 0.0)
+            .then(|| Vector2::new(self.fx * d.x + self.cx, self.fy * d.y + self.cy))
+    }
+
+    fn unproject(&self, pixel: &Vector2<f64>) -> Option<Vector3<f64>> {
+        let target = Vector2::new((pixel.x - self.cx) / self.fx, (pixel.y - self.cy) / self.fy);
+        let mut q = target;
+        for _ in 0..MAX_STEPS {
+            let (value, jacobian) = self.distorted(&q);
+            let step = jacobian.try_inverse()? * (value - target);
+            q -= step;
+            if step.norm() < TOLERANCE {
+                return (self.distorted(&q).1.determinant() > 0.0)
+                    .then(|| Vector3::new(q.x, q.y, 1.0));
+            }
+        }
+        None
     }
 }
 
@@ -461,5 +552,34 @@ mod tests {
             let numeric = (lens.decentred(&ahead) - lens.decentred(&back)) / (2.0 * h);
             assert!((numeric - lens.decentred_jacobian(&q).column(axis)).norm() < 1e-8);
         }
+    }
+
+    #[test]
+    fn the_rational_model_agrees_with_opencv_and_comes_back() {
+        let lens = Rational {
+            fx: 900.0,
+            fy: 910.0,
+            cx: 640.0,
+            cy: 360.0,
+            distortion: [0.5, -0.2, 1e-3, -2e-3, 0.01, 0.7, -0.1, 0.02],
+        };
+        let camera = Camera {
+            lens: Lens::Rational(lens),
+            width: 1280,
+            height: 720,
+            valid_radius: None,
+        };
+        let point = Vector3::new(0.3, -0.2, 1.0);
+        let pixel = camera.project(&point).unwrap();
+        // x'' and y'' by OpenCV's formula, written out.
+        let r2: f64 = 0.13;
+        let radial = (1.0 + 0.5 * r2 - 0.2 * r2.powi(2) + 0.01 * r2.powi(3))
+            / (1.0 + 0.7 * r2 - 0.1 * r2.powi(2) + 0.02 * r2.powi(3));
+        let x = 0.3 * radial + 2.0 * 1e-3 * 0.3 * -0.2 + -2e-3 * (r2 + 2.0 * 0.09);
+        let y = -0.2 * radial + 1e-3 * (r2 + 2.0 * 0.04) + 2.0 * -2e-3 * 0.3 * -0.2;
+        assert!((pixel - Vector2::new(900.0 * x + 640.0, 910.0 * y + 360.0)).norm() < 1e-9);
+        assert!((camera.unproject(&pixel).unwrap() - point).norm() < 1e-9);
+        let half = camera.resized_to(640, 360).project(&point).unwrap();
+        assert!((half - (pixel.add_scalar(0.5) / 2.0).add_scalar(-0.5)).norm() < 1e-9);
     }
 }

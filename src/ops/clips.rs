@@ -12,7 +12,7 @@ use settings::MARKERS;
 use splits::{deliver, parts, refused};
 
 use super::modality_entry::{self, DEFAULTS};
-use crate::datasets::convert::{ConvertSettings, convert};
+use crate::datasets::convert::{ConvertSettings, Share, convert};
 use crate::datasets::shards::TarSink;
 use crate::experiment::artifact::{ArtifactKind, Description, SignalFacts};
 use crate::experiment::context::{StageContext, StageError};
@@ -67,6 +67,13 @@ impl Op for Clips {
     fn data(&self, settings: &ClipsSettings) -> Vec<(String, String)> {
         let data = settings.source.settings.data.clone();
         data.map(|name| (name, "source.data".to_owned()))
+            .into_iter()
+            .collect()
+    }
+
+    fn optional_data(&self, settings: &ClipsSettings) -> Vec<(String, String)> {
+        let mano = settings.source.settings.mano();
+        mano.map(|name| (name.to_owned(), "source.mano".to_owned()))
             .into_iter()
             .collect()
     }
@@ -180,13 +187,19 @@ impl Op for Clips {
             source.name().clone_into(&mut name);
             let folder = context.checkpoints().join("clips").join(split);
             let sink = TarSink::new(&folder, &folder.join(MARKERS)).map_err(refused)?;
-            let converted = convert(source.as_ref(), &sink, &how, &mut |progress| {
-                context.progress(done + progress.done as u64, total, "clips");
-                if context.interrupted() {
-                    return ControlFlow::Break(());
-                }
-                ControlFlow::Continue(())
-            })
+            let converted = convert(
+                source.as_ref(),
+                &sink,
+                &how,
+                Share::WHOLE,
+                &mut |progress| {
+                    context.progress(done + progress.done as u64, total, "clips");
+                    if context.interrupted() {
+                        return ControlFlow::Break(());
+                    }
+                    ControlFlow::Continue(())
+                },
+            )
             .map_err(refused)?;
             if converted.interrupted {
                 return Err(StageError::Interrupted);

@@ -7,7 +7,7 @@ use super::clip_signals::{SPLITS, damaged, described_format, format};
 use super::clips::shape_of;
 use crate::clip::depth_video::{DepthCoding, DepthKind, DepthRange};
 use crate::datasets::ClipSource;
-use crate::datasets::convert::{ConvertSettings, convert};
+use crate::datasets::convert::{ConvertSettings, Share, convert};
 use crate::datasets::shards::{ShardClips, TarSink};
 use crate::engine::{Compute, DeviceChoice, Precision};
 use crate::experiment::{
@@ -236,7 +236,7 @@ impl Op for LabelDepth {
                 clips_per_shard: 32,
                 skip_damaged: false,
             };
-            let converted = convert(&source, &sink, &how, &mut |progress| {
+            let converted = convert(&source, &sink, &how, Share::WHOLE, &mut |progress| {
                 context.progress(done + progress.done as u64, total, "clips");
                 if context.interrupted() {
                     return ControlFlow::Break(());

@@ -11,6 +11,7 @@ pub mod embedded;
 pub mod exif;
 pub mod ffmpeg;
 pub mod folder;
+pub mod grey16;
 pub mod h264;
 pub mod image;
 pub mod mp4;

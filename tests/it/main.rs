@@ -42,6 +42,7 @@ mod language;
 mod language_ops;
 mod layouts;
 mod layouts_bad;
+mod layouts_hands;
 mod plugins;
 mod rules;
 mod run;

@@ -2,7 +2,7 @@
 
 use super::super::terminal::{Failure, Terminal};
 use super::{Cut, absolute, write};
-use crate::datasets::convert::ConvertSettings;
+use crate::datasets::convert::{ConvertSettings, Share};
 use crate::formats::text::of_path;
 use serde_json::json;
 use std::path::PathBuf;
@@ -21,9 +21,12 @@ pub(super) struct Convert {
     /// Clips per shard
     #[arg(long, default_value_t = 100, value_name = "N")]
     clips_per_shard: usize,
-    /// Leave out damaged clips and say which, instead of stopping at the first one
+    /// Make only this part of the shards: 1/8, 2/8 ... 8/8, one process each, into the same folder
+    #[arg(long, default_value = "1/1", value_name = "I/N")]
+    shard: Share,
+    /// Stop at the first damaged clip; otherwise they are left out and listed
     #[arg(long)]
-    skip_damaged: bool,
+    strict: bool,
     /// Write the result as JSON to stdout
     #[arg(long)]
     json: bool,
@@ -35,7 +38,7 @@ impl Convert {
         let source = self.cut.open(&self.path, &cut)?;
         let settings = ConvertSettings {
             clips_per_shard: self.clips_per_shard,
-            skip_damaged: self.skip_damaged,
+            skip_damaged: !self.strict,
         };
         let request = json!({
             "recordings": of_path(&absolute(&self.path)), "clips": source.len(), "cut": cut, "shards": settings,
@@ -46,6 +49,7 @@ impl Convert {
             source.as_ref(),
             request,
             &settings,
+            self.shard,
             &self.output,
             self.json,
         )

@@ -4,7 +4,7 @@ use super::super::terminal::{Failure, Terminal};
 use super::source_entry;
 use crate::datasets::ReadError;
 use crate::datasets::cut::CutSettings;
-use crate::datasets::open::{Dataset, OpenWith, open};
+use crate::datasets::open::{Dataset, HandModel, OpenWith, open};
 use crate::datasets::split::SplitSettings;
 use crate::datasets::status::{Status, status};
 use crate::experiment::catalog::Catalog;
@@ -56,6 +56,9 @@ struct Plan {
     dataset: Option<Dataset>,
     cut: CutSettings,
     split: SplitSettings,
+    /// The name in `data.yaml` of the MANO models, where the set may need them.
+    mano: Option<String>,
+    hands: HandModel,
 }
 
 impl StatusCommand {
@@ -89,7 +92,7 @@ impl StatusCommand {
         }
         let rows: Vec<Row> = plans
             .into_iter()
-            .map(|(name, plan)| look(name, &plan, roots.get(&plan.data)))
+            .map(|(name, plan)| look(name, &plan, &roots))
             .collect();
         if self.json {
             terminal.json(&rows);
@@ -116,8 +119,11 @@ fn plans(roots: &BTreeMap<String, DataRoot>) -> Result<BTreeMap<String, Plan>, F
     for name in registry.names("source") {
         let name = name.to_owned();
         let entry = source_entry(&name)?;
+        let mano = entry.mano().map(str::to_owned);
         if let Some(data) = entry.data {
             let plan = Plan {
+                mano,
+                hands: entry.hands,
                 data,
                 dataset: entry.dataset,
                 cut: entry.cut,
@@ -127,12 +133,16 @@ fn plans(roots: &BTreeMap<String, DataRoot>) -> Result<BTreeMap<String, Plan>, F
         }
     }
     for name in roots.keys() {
-        if plans.values().all(|plan| plan.data != *name) {
+        // The MANO models are no data set.
+        let models = plans.values().any(|plan| plan.mano.as_ref() == Some(name));
+        if !models && plans.values().all(|plan| plan.data != *name) {
             let plan = Plan {
                 data: name.clone(),
                 dataset: None,
                 cut: CutSettings::default(),
                 split: SplitSettings::default(),
+                mano: Some("mano".to_owned()),
+                hands: HandModel::default(),
             };
             plans.insert(name.clone(), plan);
         }
@@ -140,7 +150,8 @@ fn plans(roots: &BTreeMap<String, DataRoot>) -> Result<BTreeMap<String, Plan>, F
     Ok(plans)
 }
 
-fn look(name: String, plan: &Plan, root: Option<&DataRoot>) -> Row {
+fn look(name: String, plan: &Plan, roots: &BTreeMap<String, DataRoot>) -> Row {
+    let root = roots.get(&plan.data);
     let mut row = Row {
         name,
         data: plan.data.clone(),
@@ -158,7 +169,13 @@ fn look(name: String, plan: &Plan, root: Option<&DataRoot>) -> Row {
         row.reason = Some("the folder does not exist".to_owned());
         return row;
     }
-    match open(&root.path, plan.dataset, &plan.cut, OpenWith::default()) {
+    let mano = plan.mano.as_ref().and_then(|name| roots.get(name));
+    let with = OpenWith {
+        mano: mano.map(|root| root.path.as_path()),
+        hands: plan.hands,
+        ..OpenWith::default()
+    };
+    match open(&root.path, plan.dataset, &plan.cut, with) {
         Ok(source) => {
             row.state = "found";
             row.status = Some(status(source.as_ref(), &plan.split, plan.cut.stride));

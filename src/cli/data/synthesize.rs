@@ -2,7 +2,7 @@
 
 use super::super::terminal::{Failure, Terminal};
 use super::{source_entry, write};
-use crate::datasets::convert::ConvertSettings;
+use crate::datasets::convert::{ConvertSettings, Share};
 use crate::world::{World, WorldClips};
 use serde_json::json;
 use std::path::PathBuf;
@@ -31,6 +31,9 @@ pub(super) struct Synthesize {
     /// Clips per shard
     #[arg(long, default_value_t = 100, value_name = "N")]
     clips_per_shard: usize,
+    /// Make only this part of the shards: 1/8, 2/8 ... 8/8, one process each, into the same folder
+    #[arg(long, default_value = "1/1", value_name = "I/N")]
+    shard: Share,
     /// Write the result as JSON to stdout
     #[arg(long)]
     json: bool,
@@ -66,6 +69,7 @@ impl Synthesize {
             &source,
             request,
             &settings,
+            self.shard,
             &self.output,
             self.json,
         )

@@ -3,7 +3,7 @@
 use super::manifest::LensEntry;
 use crate::formats::ReadError;
 use crate::formats::read_error::Position;
-use crate::geometry::camera::{Camera, Fisheye624, KannalaBrandt, Lens, Pinhole};
+use crate::geometry::camera::{Camera, Fisheye624, KannalaBrandt, Lens, Pinhole, Rational};
 use std::path::Path;
 
 pub(super) fn lens_of(path: &Path, entry: &LensEntry) -> Result<Camera, ReadError> {
@@ -40,6 +40,19 @@ pub(super) fn lens_of(path: &Path, entry: &LensEntry) -> Result<Camera, ReadErro
             }),
             *size,
         ),
+        LensEntry::Rational {
+            parameters: [fx, fy, cx, cy, distortion @ ..],
+            size,
+        } => (
+            Lens::Rational(Rational {
+                fx: *fx,
+                fy: *fy,
+                cx: *cx,
+                cy: *cy,
+                distortion: *distortion,
+            }),
+            *size,
+        ),
         LensEntry::Fisheye624 { parameters, size } => (
             Lens::Fisheye624(Fisheye624::from_parameters(parameters).ok_or_else(wrong)?),
             *size,
@@ -47,7 +60,8 @@ pub(super) fn lens_of(path: &Path, entry: &LensEntry) -> Result<Camera, ReadErro
     };
     let parameters_ok = match &lens {
         Lens::Pinhole(Pinhole { fx, fy, .. })
-        | Lens::KannalaBrandt(KannalaBrandt { fx, fy, .. }) => *fx > 0.0 && *fy > 0.0,
+        | Lens::KannalaBrandt(KannalaBrandt { fx, fy, .. })
+        | Lens::Rational(Rational { fx, fy, .. }) => *fx > 0.0 && *fy > 0.0,
         Lens::Fisheye624(_) => true,
     };
     if !parameters_ok || width == 0 || height == 0 {

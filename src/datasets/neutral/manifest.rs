@@ -61,6 +61,11 @@ pub(super) enum LensEntry {
         parameters: [f64; 8],
         size: [u32; 2],
     },
+    /// `fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6`, OpenCV's rational model
+    Rational {
+        parameters: [f64; 12],
+        size: [u32; 2],
+    },
     /// `f cx cy k0..k5 p0 p1 s0..s3`
     Fisheye624 {
         parameters: [f64; 15],

@@ -72,7 +72,7 @@ impl Recording {
         distinct.dedup();
         let side = settings.side as usize;
         let mut squares = Vec::with_capacity(distinct.len());
-        let mut depths = Vec::with_capacity(distinct.len());
+        let mut depths: Vec<Vec<f32>> = Vec::new();
         // One picture at a time: full-size pictures are not held.
         colour.read(&distinct, &mut |_, picture| {
             squares.push(self.square(picture, settings).data);
@@ -85,11 +85,27 @@ impl Recording {
             )));
         }
         if let Some(depth) = &self.depth {
-            for &frame in &distinct {
-                let time = colour.times()[frame];
-                let near = nearest(depth.times(), time).unwrap_or(0);
-                depths.push(self.square_depth(&depth.read(near)?, settings));
+            let near: Vec<usize> = distinct
+                .iter()
+                .map(|&frame| nearest(depth.times(), colour.times()[frame]).unwrap_or(0))
+                .collect();
+            let mut each = near.clone();
+            each.dedup();
+            let mut maps = Vec::with_capacity(each.len());
+            depth.read_several(&each, &mut |metres| {
+                maps.push(self.square_depth(&metres, settings));
+            })?;
+            if maps.len() != each.len() {
+                return Err(ReadError::Settings(format!(
+                    "{} of {} depth maps were read",
+                    maps.len(),
+                    each.len()
+                )));
             }
+            depths = near
+                .iter()
+                .map(|index| maps[each.binary_search(index).unwrap_or(0)].clone())
+                .collect();
         }
         let find = |frame: usize| distinct.binary_search(&frame).unwrap_or(0);
         let mut pixels = Vec::with_capacity(chosen.len() * side * side * 3);

@@ -87,6 +87,11 @@ impl Dtype {
         Self::F64,
     ];
 
+    /// By NumPy's code without byte order: `f8`, `i4`, `b1`.
+    pub fn from_code(code: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|d| &d.code()[1..] == code)
+    }
+
     /// Bytes per element.
     pub fn width(self) -> usize {
         match self {

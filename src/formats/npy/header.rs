@@ -59,6 +59,26 @@ impl Header {
     }
 }
 
+/// Where the pickle of an npy file of objects starts.
+pub(super) fn pickle_start(bytes: &[u8]) -> Result<usize, FormatError> {
+    let refused = match Header::parse(bytes) {
+        Ok(header) => {
+            let code = header.dtype.code();
+            let reason = format!("an array of type `{code}`, not of objects");
+            return Err(malformed(0, reason));
+        }
+        Err(error) => error,
+    };
+    let end = match (bytes.get(6), bytes.get(8..12)) {
+        (Some(1), Some(l)) => 10 + usize::from(u16::from_le_bytes([l[0], l[1]])),
+        (_, Some(l)) => 12 + u32::from_le_bytes([l[0], l[1], l[2], l[3]]) as usize,
+        _ => return Err(refused),
+    };
+    let header = bytes.get(10..end).unwrap_or(&[]);
+    let objects = header.windows(4).any(|word| word == b"'|O'");
+    if objects { Ok(end) } else { Err(refused) }
+}
+
 /// The element type that `descr` names, and whether its bytes are in big-endian order.
 pub(super) fn dtype(descr: &str) -> Result<(Dtype, bool), String> {
     let (order, kind) = descr.split_at(usize::from(descr.starts_with(['<', '>', '|', '='])));

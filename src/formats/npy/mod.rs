@@ -95,6 +95,17 @@ fn assemble(header: Header, body: &[u8]) -> Result<NpyArray, FormatError> {
     Ok(NpyArray { shape, data })
 }
 
+/// Where the pickle of an npy file of objects starts; `None` for bytes that are no npy file.
+///
+/// # Errors
+/// When it is an npy file of numbers, or its header is damaged.
+pub fn pickle_start(bytes: &[u8]) -> Result<Option<usize>, FormatError> {
+    if !bytes.starts_with(b"\x93NUMPY") {
+        return Ok(None);
+    }
+    header::pickle_start(bytes).map(Some)
+}
+
 /// The bytes of an npy file (version 1.0, little-endian, C order).
 pub fn to_bytes(array: &NpyArray) -> Vec<u8> {
     let mut shape: Vec<String> = array.shape.iter().map(usize::to_string).collect();

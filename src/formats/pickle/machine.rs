@@ -2,7 +2,10 @@
 
 use super::literal::{text_or_bytes, unescaped, unquoted};
 use super::objects::long;
-use super::{CUT, Id, MAX_LINE, MAX_NODES, MAX_TEXT, Node, PickleError};
+use super::{
+    CUT, Id, MAX_FILE_NODES, MAX_FILE_TEXT, MAX_LINE, MAX_NODES, MAX_SHORT, MAX_TEXT, Node,
+    PickleError, StoredBytes,
+};
 use std::collections::BTreeMap;
 
 /// A pickle on its way.
@@ -17,6 +20,12 @@ pub(super) struct Machine<'a> {
     memo: BTreeMap<u32, Id>,
     /// Bytes that calls have copied so far.
     pub(super) copied: usize,
+    /// Where the bytes begin in the file in which long byte strings stay.
+    pub(super) file_offset: Option<u64>,
+    /// Storages whose bytes are in this pickle, by the key that their tensors name.
+    pub(super) storages: BTreeMap<String, StoredBytes>,
+    /// Bytes in which calls may still look for storages: honest pickles do it once with each of their own.
+    pub(super) storage_budget: usize,
 }
 
 impl<'a> Machine<'a> {
@@ -30,15 +39,22 @@ impl<'a> Machine<'a> {
             marks: Vec::new(),
             memo: BTreeMap::new(),
             copied: 0,
+            file_offset: None,
+            storages: BTreeMap::new(),
+            storage_budget: bytes.len(),
         }
     }
 
-    /// All objects, the one that the pickle is, and where it ends.
-    pub(super) fn run(mut self) -> Result<(Vec<Node>, Id, usize), PickleError> {
+    /// Runs to the end: the object that the pickle is, and where it ends.
+    pub(super) fn run(&mut self) -> Result<(Id, usize), PickleError> {
+        let most = match self.file_offset {
+            Some(_) => MAX_FILE_NODES,
+            None => MAX_NODES,
+        };
         loop {
             self.start = self.at;
-            if self.nodes.len() > MAX_NODES {
-                return self.refuse(format!("more than {MAX_NODES} objects"));
+            if self.nodes.len() > most {
+                return self.refuse(format!("more than {most} objects"));
             }
             let opcode = self.u8()?;
             match opcode {
@@ -53,7 +69,7 @@ impl<'a> Machine<'a> {
                 0x95 => drop(self.take(8)?),
                 b'.' => {
                     let root = self.pop()?;
-                    return Ok((self.nodes, root, self.at));
+                    return Ok((root, self.at));
                 }
                 b'(' => self.marks.push(self.stack.len()),
                 b'0' => drop(self.pop()?),
@@ -119,6 +135,10 @@ impl<'a> Machine<'a> {
                     } else {
                         self.u8()?.into()
                     };
+                    if self.stays(length) {
+                        self.payload(length)?;
+                        continue;
+                    }
                     if length > MAX_TEXT {
                         return self.refuse(format!("a text of {length} bytes"));
                     }
@@ -148,19 +168,16 @@ impl<'a> Machine<'a> {
                 }
                 b'B' => {
                     let length = self.u32()? as usize;
-                    let bytes = self.take(length)?.to_vec();
-                    self.push(Node::Bytes(bytes));
+                    self.payload(length)?;
                 }
                 // BINBYTES8, BYTEARRAY8
                 0x8e | 0x96 => {
                     let length = self.u64()?;
-                    let bytes = self.take(length)?.to_vec();
-                    self.push(Node::Bytes(bytes));
+                    self.payload(length)?;
                 }
                 b'C' => {
                     let length = self.u8()?;
-                    let bytes = self.take(length.into())?.to_vec();
-                    self.push(Node::Bytes(bytes));
+                    self.payload(length.into())?;
                 }
                 // EMPTY_SET, ADDITEMS, FROZENSET
                 0x8f => self.push(Node::Set(Vec::new())),
@@ -307,12 +324,41 @@ impl<'a> Machine<'a> {
         })
     }
 
+    /// Bytes that were taken before.
+    pub(super) fn earlier(&self, stored: &StoredBytes) -> Option<&'a [u8]> {
+        let StoredBytes::File { offset, length } = stored else {
+            return None;
+        };
+        let start = usize::try_from(offset.checked_sub(self.file_offset?)?).ok()?;
+        self.bytes.get(start..start.checked_add(*length as usize)?)
+    }
+
     fn take(&mut self, count: usize) -> Result<&'a [u8], PickleError> {
         let Some(bytes) = self.bytes[self.at..].get(..count) else {
             return self.refuse(CUT);
         };
         self.at += count;
         Ok(bytes)
+    }
+
+    /// Whether a byte string of this length stays in the file.
+    fn stays(&self, length: usize) -> bool {
+        self.file_offset.is_some() && length > MAX_SHORT
+    }
+
+    /// A byte string as an object.
+    fn payload(&mut self, length: usize) -> Result<(), PickleError> {
+        let at = self.at as u64;
+        let bytes = self.take(length)?;
+        let node = match self.file_offset {
+            Some(start) if length > MAX_SHORT => Node::Stored(StoredBytes::File {
+                offset: start + at,
+                length: length as u64,
+            }),
+            _ => Node::Bytes(bytes.to_vec()),
+        };
+        self.push(node);
+        Ok(())
     }
 
     fn array<const N: usize>(&mut self) -> Result<[u8; N], PickleError> {
@@ -345,7 +391,11 @@ impl<'a> Machine<'a> {
     }
 
     fn text(&mut self, length: usize) -> Result<String, PickleError> {
-        if length > MAX_TEXT {
+        let most = match self.file_offset {
+            Some(_) => MAX_FILE_TEXT,
+            None => MAX_TEXT,
+        };
+        if length > most {
             return self.refuse(format!("a text of {length} bytes"));
         }
         match std::str::from_utf8(self.take(length)?) {

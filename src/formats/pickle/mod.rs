@@ -4,18 +4,26 @@
 //! A pickle is a program. This one runs on an arena: every object is an index, so that deep nesting cannot overflow the
 //! stack, sharing through the memo cannot multiply memory, and the work is linear in the length of the file. An opcode or a
 //! global name outside the lists is an error that names it; nothing in the file is ever called.
+//!
+//! Checkpoints are parsed in memory ([`Pickle::parse`]); of the pickles of data sets, which hold arrays, the arrays stay in the file
+//! until they are asked for ([`Pickle::open`], [`StoredArray`]).
 
 mod literal;
 mod machine;
 mod names;
+mod numbers;
 mod objects;
 mod tensor;
 
+pub use numbers::StoredArray;
 pub use tensor::{Scalar, Storage, TensorView};
 
-use super::FormatError;
 use super::npy::{self, NpyArray};
+use super::read_error::Position;
+use super::{FormatError, ReadError};
 use machine::Machine;
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 /// Why a pickle is refused.
@@ -48,6 +56,8 @@ pub enum Node {
     Float(f64),
     Text(String),
     Bytes(Vec<u8>),
+    /// Bytes that are elsewhere: in the file.
+    Stored(StoredBytes),
     Tuple(Vec<Id>),
     List(Vec<Id>),
     /// Keys in the order of insertion; `OrderedDict` too.
@@ -71,6 +81,15 @@ pub enum Node {
     Array(ArrayView),
     /// A tensor without strided values: what it is, in words.
     Opaque(&'static str),
+}
+
+/// Where bytes are.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum StoredBytes {
+    /// In the pickle's file.
+    File { offset: u64, length: u64 },
+    /// In an object of bytes, from `start` to its end.
+    Node { id: Id, start: u64 },
 }
 
 /// A NumPy array; its bytes are another node, so that nothing is copied.
@@ -129,7 +148,9 @@ pub enum Global {
     Encode,
     /// `torch.jit._pickle.build_intlist` and its kin: the list itself.
     TypedList,
-    /// A class compiled by TorchScript, `__torch__.module.Class`.
+    /// `torch.storage._load_from_bytes`
+    StorageFromBytes,
+    /// A class compiled by TorchScript, `__torch__.module.Class`, or one of chumpy or SciPy: nothing but its dictionary.
     Script(Arc<str>),
 }
 
@@ -138,6 +159,9 @@ pub enum Global {
 pub struct Pickle {
     nodes: Vec<Node>,
     root: Id,
+    storages: BTreeMap<String, StoredBytes>,
+    /// The file in which long byte strings stayed.
+    path: Option<PathBuf>,
 }
 
 /// More than any checkpoint's object tree; the tensors themselves are elsewhere.
@@ -145,6 +169,14 @@ const MAX_BYTES: usize = 16 << 20;
 /// A training checkpoint of the largest released model has some twenty thousand objects.
 const MAX_NODES: usize = 1 << 19;
 const MAX_TEXT: usize = 1 << 20;
+/// The splits of ARCTIC name 1.6 million pictures.
+const MAX_FILE_NODES: usize = 1 << 22;
+/// Old protocols write arrays as text.
+const MAX_FILE_TEXT: usize = 64 << 20;
+/// The splits of ARCTIC have some gigabytes each.
+const MAX_FILE_BYTES: u64 = 16 << 30;
+/// Byte strings of a file that are longer than this stay there.
+const MAX_SHORT: usize = 1 << 10;
 /// Names and numbers of protocol 0.
 const MAX_LINE: usize = 1024;
 /// Keys of storages, codes of NumPy types and names of devices: names can be called on the same text again and again, so what
@@ -170,8 +202,50 @@ impl Pickle {
     /// Reads the pickle that `bytes` begin with, whatever follows, and says how long it is.
     pub fn parse_first(bytes: &[u8]) -> Result<(Self, usize), PickleError> {
         let bytes = &bytes[..bytes.len().min(MAX_BYTES)];
-        let (nodes, root, end) = Machine::new(bytes).run()?;
-        Ok((Self { nodes, root }, end))
+        let mut machine = Machine::new(bytes);
+        let (root, end) = machine.run()?;
+        let pickle = Self {
+            nodes: machine.nodes,
+            root,
+            storages: machine.storages,
+            path: None,
+        };
+        Ok((pickle, end))
+    }
+
+    /// Reads the pickle of a data set: its arrays stay in the file. A pickled npy file is one too.
+    ///
+    /// # Errors
+    /// When the file is damaged, or wants more than data.
+    pub fn open(path: &Path) -> Result<Self, ReadError> {
+        let bytes = super::read_whole(path, MAX_FILE_BYTES)
+            .map_err(|error| ReadError::Format(error.in_file(path)))?;
+        let start = npy::pickle_start(&bytes)
+            .map_err(|error| ReadError::Format(error.in_file(path)))?
+            .unwrap_or(0);
+        let mut machine = Machine::new(&bytes[start..]);
+        machine.file_offset = Some(start as u64);
+        let (root, _) = machine.run().map_err(|error| {
+            ReadError::malformed(
+                path,
+                Position::Offset((start + error.offset) as u64),
+                format!("pickle: {}", error.reason),
+            )
+        })?;
+        let mut pickle = Self {
+            nodes: machine.nodes,
+            root,
+            storages: machine.storages,
+            path: Some(path.to_owned()),
+        };
+        // `np.save` of a dictionary is an array without axes whose only element it is.
+        if let Node::Array(array) = pickle.node(root)
+            && let Some(Node::List(items)) = array.bytes.map(|items| pickle.node(items))
+            && let [only] = items.as_slice()
+        {
+            pickle.root = *only;
+        }
+        Ok(pickle)
     }
 
     /// All objects, in the order in which they were made.

@@ -100,6 +100,13 @@ impl Machine<'_> {
                 Global::RebuildFromType
             }
             ("torch.nn.parameter" | "torch.nn", "Parameter" | "Buffer") => Global::Parameter,
+            ("torch.storage", "_load_from_bytes") => Global::StorageFromBytes,
+            ("scipy.sparse.csc" | "scipy.sparse._csc", "csc_matrix") => {
+                Global::Script("scipy.sparse.csc_matrix".into())
+            }
+            ("scipy.sparse.csr" | "scipy.sparse._csr", "csr_matrix") => {
+                Global::Script("scipy.sparse.csr_matrix".into())
+            }
             ("torch.serialization", "_get_layout") => Global::Layout,
             ("numpy.core.multiarray" | "numpy._core.multiarray", "scalar") => Global::NumpyScalar,
             ("numpy.core.multiarray" | "numpy._core.multiarray", "_reconstruct") => {
@@ -133,7 +140,12 @@ impl Machine<'_> {
                     _ => return self.forbidden(module, name),
                 }
             }
-            (module, name) if module == "__torch__" || module.starts_with("__torch__.") => {
+            // What chumpy computes is not asked for: its objects are the dictionaries that they were given.
+            (module, name)
+                if module == "__torch__"
+                    || module.starts_with("__torch__.")
+                    || module.starts_with("chumpy.") =>
+            {
                 Global::Script(format!("{module}.{name}").into())
             }
             _ => return self.forbidden(module, name),

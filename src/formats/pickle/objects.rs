@@ -2,7 +2,8 @@
 
 use super::machine::Machine;
 use super::{
-    ArrayView, Global, Id, MAX_COPIED, MAX_COPIES, Node, PickleError, Scalar, Storage, TensorView,
+    ArrayView, Global, Id, MAX_COPIED, MAX_COPIES, Node, PickleError, Scalar, Storage, StoredBytes,
+    TensorView,
 };
 
 /// More than any function of the list has.
@@ -57,6 +58,7 @@ impl Machine<'_> {
             (Global::Bytes, [text, codec]) | (Global::Encode, [text, codec]) => {
                 self.latin1(*text, *codec)?
             }
+            (Global::StorageFromBytes, [bytes]) => Node::Storage(self.storage_from_bytes(*bytes)?),
             (Global::Complex, [real, imaginary]) => {
                 Node::Complex(self.float(*real)?, self.float(*imaginary)?)
             }
@@ -310,7 +312,13 @@ impl Machine<'_> {
         let Node::Dtype(dtype) = self.node(dtype) else {
             return self.refuse("a NumPy array without a type");
         };
-        if !matches!(self.node(bytes), Node::Bytes(_)) {
+        // Python 2 did not tell text from bytes; arrays of objects hold a list.
+        let there = match self.node(bytes) {
+            Node::Bytes(_) | Node::Stored(_) | Node::Text(_) => true,
+            Node::List(_) => dtype.starts_with('O'),
+            _ => false,
+        };
+        if !there {
             return self.refuse(format!("a NumPy array of type `{dtype}` without bytes"));
         }
         Ok(ArrayView {
@@ -319,6 +327,63 @@ impl Machine<'_> {
             fortran,
             bytes: Some(bytes),
         })
+    }
+
+    /// `torch.storage._load_from_bytes`: a whole file of torch's first format inside a string. It holds five pickles (a magic
+    /// number, a version, sizes of types, the storage, the list of keys), then the number of elements and their bytes.
+    fn storage_from_bytes(&mut self, id: Id) -> Result<Storage, PickleError> {
+        const MAGIC: i128 = 0x1950_a86a_20f9_469c_fc6c;
+        let bytes = match self.node(id) {
+            Node::Bytes(bytes) => bytes.as_slice(),
+            Node::Stored(stored) => match self.earlier(stored) {
+                Some(bytes) => bytes,
+                None => return self.refuse("a storage whose bytes are not there"),
+            },
+            _ => return self.refuse("a storage that is not made of bytes"),
+        };
+        let length = bytes.len();
+        if length > self.storage_budget {
+            return self.refuse("more storages read than the pickle has bytes");
+        }
+        let wrong = |reason: &str| self.refuse(format!("inside a torch storage: {reason}"));
+        let (mut inner, mut at) = (None, 0);
+        for number in 0..5 {
+            let mut machine = Machine::new(&bytes[at..]);
+            // A storage in a storage would run this function inside itself.
+            machine.storage_budget = 0;
+            let (root, end) = match machine.run() {
+                Ok(done) => done,
+                Err(error) => return wrong(&error.reason),
+            };
+            at += end;
+            match (number, machine.node(root)) {
+                (0, Node::Int(MAGIC)) | (1 | 2 | 4, _) => {}
+                (3, Node::Storage(storage)) => inner = Some(storage.clone()),
+                _ => return wrong("not torch's first format"),
+            }
+        }
+        let Some(inner) = inner else {
+            return wrong("there is no storage");
+        };
+        let Some((count, data)) = bytes[at..].split_first_chunk::<8>() else {
+            return wrong("cut short");
+        };
+        let needed = inner.elements.checked_mul(inner.scalar.width() as u64);
+        if u64::from_le_bytes(*count) != inner.elements || needed != Some(data.len() as u64) {
+            return wrong("its bytes are not as many as its elements need");
+        }
+        let start = at as u64 + 8;
+        let key = format!("bytes of object {}", id.0);
+        let stored = match self.node(id) {
+            Node::Stored(StoredBytes::File { offset, length }) => StoredBytes::File {
+                offset: offset + start,
+                length: length - start,
+            },
+            _ => StoredBytes::Node { id, start },
+        };
+        self.storage_budget -= length;
+        self.storages.insert(key.clone(), stored);
+        Ok(Storage { key, ..inner })
     }
 
     fn tensor(
@@ -395,6 +460,8 @@ impl Machine<'_> {
             ("u2", _) if width == 2 => unsigned(bytes),
             ("u1", _) if width == 1 => unsigned(bytes),
             ("b1", &[value @ (0 | 1)]) => Some(Node::Bool(value == 1)),
+            // `numpy.str_`: four bytes a character, filled up with zeros.
+            (code, bytes) if code.starts_with('U') => ucs4(bytes).map(Node::Text),
             _ => None,
         };
         match node {
@@ -424,6 +491,18 @@ fn unsigned(bytes: &[u8]) -> Option<Node> {
     let mut wide = [0; 16];
     wide.get_mut(..bytes.len())?.copy_from_slice(bytes);
     Some(Node::Int(i128::from_le_bytes(wide)))
+}
+
+/// Text of four bytes a character.
+fn ucs4(bytes: &[u8]) -> Option<String> {
+    let mut text = String::new();
+    for chunk in bytes.chunks(4) {
+        let code = u32::from_le_bytes(chunk.try_into().ok()?);
+        if code != 0 {
+            text.push(char::from_u32(code)?);
+        }
+    }
+    Some(text)
 }
 
 /// A little-endian two's complement integer.

@@ -1,7 +1,7 @@
 //! What an experiment says of its clips.
 
 use crate::clip::depth_video::DepthCoding;
-use crate::datasets::open::Dataset;
+use crate::datasets::open::{Dataset, HandModel};
 use crate::datasets::recording::CutSettings;
 use crate::datasets::split::SplitSettings;
 use crate::experiment::entry::{Entry, Kind, KindEntry};
@@ -21,6 +21,11 @@ pub struct SourceSettings {
     pub data: Option<String>,
     /// What lies there; left out: what it looks like.
     pub dataset: Option<Dataset>,
+    /// The folder of `data.yaml` with the MANO models; left out: `mano`. Sets whose hands are MANO parameters go without hands where it
+    /// is not there.
+    pub mano: Option<String>,
+    /// Which model gives a hand its joints, where a data set has the parameters of both.
+    pub hands: HandModel,
     /// How clips are cut from recordings.
     pub cut: CutSettings,
     /// Which recordings are for training, which for validation and which for the test.
@@ -30,6 +35,12 @@ pub struct SourceSettings {
 }
 
 impl SourceSettings {
+    /// The name in `data.yaml` of the MANO models, for sets that may need them.
+    pub fn mano(&self) -> Option<&str> {
+        let needed = self.data.is_some() && HandModel::may_need_mano(self.dataset);
+        needed.then(|| self.mano.as_deref().unwrap_or("mano"))
+    }
+
     /// The sizes of the clips.
     pub fn format(&self) -> ClipFormat {
         match self.data {

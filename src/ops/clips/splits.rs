@@ -20,7 +20,7 @@ pub(super) type Part = (&'static str, Arc<dyn ClipSource>);
 pub(super) fn parts(
     settings: &ClipsSettings,
     format: &ClipFormat,
-    context: &dyn StageContext,
+    context: &mut dyn StageContext,
 ) -> Result<Vec<Part>, StageError> {
     let from = &settings.source.settings;
     let Some(data) = &from.data else {
@@ -39,7 +39,8 @@ pub(super) fn parts(
     })?;
     let with = OpenWith {
         declared: &format.declared,
-        ..OpenWith::default()
+        mano: from.mano().and_then(|name| context.data_root(name)),
+        hands: from.hands,
     };
     let source = open(root, from.dataset, &from.cut, with).map_err(refused)?;
     if let Some(there) = source.format() {
@@ -55,6 +56,15 @@ pub(super) fn parts(
                     .to_owned(),
             });
         }
+    }
+    for (note, count) in source.notes() {
+        context.log(&format!("{count} recordings: {note}"));
+    }
+    for excluded in source.excluded() {
+        context.log(&format!(
+            "excluded: `{}`: {}",
+            excluded.recording, excluded.reason
+        ));
     }
     let asked: Vec<(&'static str, u64)> = settings
         .splits()
