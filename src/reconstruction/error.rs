@@ -24,9 +24,9 @@ pub enum ReconstructError {
     #[error("the video ends before its frame {before}")]
     Ends { before: usize },
     #[error(
-        "`body` over several windows needs the camera path, which says where each window starts"
+        "`{modality}` over several windows needs the camera path, which says where each window starts"
     )]
-    NoCameraPath,
+    NoCameraPath { modality: String },
     #[error("stopped by its callback")]
     Stopped,
     #[error(transparent)]

@@ -8,8 +8,9 @@ use super::lens::LensSettings;
 use super::recording::Recording;
 use super::result::{Reconstruction, ReconstructionInfo};
 use super::scale::FloorFit;
+use super::stitch::follows_camera;
 use super::windows::{samples_of, windows};
-use crate::clip::{Clip, RGB};
+use crate::clip::{CAMERA, Clip, RGB};
 use crate::decoding::DecodingSettings;
 use crate::engine::Compute;
 use crate::flow::Flow;
@@ -150,9 +151,13 @@ pub fn reconstruct_recording(
     let format = model.format().clone();
     let (inputs, targets) = (options.inputs_of(model), options.targets_of(model));
     let list = windows(recording.seconds, options.overlap)?;
-    let has = |name: &str| targets.iter().any(|target| target == name);
-    if list.len() > 1 && has("body") && !has("camera") {
-        return Err(ReconstructError::NoCameraPath);
+    let follower = targets.iter().find(|target| follows_camera(target));
+    if let Some(modality) = follower
+        && list.len() > 1
+        && !targets.iter().any(|target| target == CAMERA.name())
+    {
+        let modality = modality.clone();
+        return Err(ReconstructError::NoCameraPath { modality });
     }
     let rate = format.video_rate;
     let frames = ((recording.seconds * rate - 1e-6).ceil() as usize).max(1);

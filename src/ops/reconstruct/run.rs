@@ -163,7 +163,7 @@ fn failed(error: ReconstructError) -> StageError {
         ReconstructError::Ends { .. } | ReconstructError::Read(_) => {
             "check the file, or convert it with `ffmpeg`"
         }
-        ReconstructError::NoCameraPath => "add `camera` to `targets`",
+        ReconstructError::NoCameraPath { .. } => "add `camera` to `targets`",
         ReconstructError::Camera(_) => "correct `lens`",
         ReconstructError::Windows(_) => "choose another `overlap`",
         ReconstructError::Anchor(_) => "see `anchor` in `reviv show reconstruct`",
