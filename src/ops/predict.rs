@@ -99,7 +99,7 @@ impl Op for Predict {
     }
 
     fn version(&self) -> u32 {
-        3
+        4
     }
 
     fn about(&self) -> &'static str {

@@ -99,7 +99,7 @@ impl Op for Reconstruct {
     }
 
     fn version(&self) -> u32 {
-        4
+        5
     }
 
     fn about(&self) -> &'static str {

@@ -71,7 +71,7 @@ impl Op for Tokenize {
     }
 
     fn version(&self) -> u32 {
-        2
+        3
     }
 
     fn about(&self) -> &'static str {

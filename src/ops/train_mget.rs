@@ -106,7 +106,7 @@ impl Op for TrainMget {
     }
 
     fn version(&self) -> u32 {
-        2
+        3
     }
 
     fn about(&self) -> &'static str {

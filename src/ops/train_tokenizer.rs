@@ -146,7 +146,7 @@ impl Op for TrainTokenizer {
     }
 
     fn version(&self) -> u32 {
-        5
+        6
     }
 
     fn about(&self) -> &'static str {
