@@ -130,7 +130,7 @@ fn encoder(mut file: Vectors, report: &mut Report) -> Outcome {
     let padding = file.tensor("padding")?.u8("padding")?.to_vec();
     let lengths: Vec<usize> = padding
         .chunks_exact(longest)
-        .map(|clip| clip.iter().filter(|flag| **flag == 0).count())
+        .map(|clip| clip.iter().map(|flag| usize::from(*flag == 0)).sum())
         .collect();
     let values = x.f32("x")?;
     let clips: Vec<&[f32]> = lengths

@@ -23,6 +23,7 @@ use crate::formats::text::of_path;
 use crate::ops::clips::SourceSettings;
 use crate::video::DecoderChoice;
 use serde::Deserialize as _;
+use std::fmt::Write as _;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -178,11 +179,11 @@ fn remarks(source: &dyn ClipSource) -> String {
         } else {
             String::new()
         };
-        lines.push_str(&format!("note: {note}{share}\n"));
+        let _ = writeln!(lines, "note: {note}{share}");
     }
     for excluded in source.excluded() {
         let name = &excluded.recording;
-        lines.push_str(&format!("excluded: `{name}`: {}\n", excluded.reason));
+        let _ = writeln!(lines, "excluded: `{name}`: {}", excluded.reason);
     }
     lines
 }

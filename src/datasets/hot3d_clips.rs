@@ -5,36 +5,31 @@
 //! head camera is 214-1 of Aria and 1201-1 of Quest, whose pictures are stored turned. Aria's world is z-up, Quest's y-up. Clips of
 //! the test have no hands.
 
+mod tar;
+
 use super::aria::calibration::unit_quaternion;
 use super::dataset::Recordings;
 use super::files::tick;
 use super::mano::{self, Mano};
-use super::recording::{ColourFrames, CutSettings, MountedCamera, Recording};
+use super::recording::{CutSettings, MountedCamera, Recording};
 use super::track::{Joints, SECOND, Track};
 use super::umetrack::{ANGLES, HandProfile};
 use super::{ReadError, open::HandModel};
 use crate::formats::read_error::Position;
 use crate::geometry::camera::{Camera, Fisheye624, Lens};
 use crate::geometry::mano::{Convention, FingerPose, ManoPose, SHAPE};
-use crate::video::image::{Image, Turn};
+use crate::video::image::Turn;
 use nalgebra::{Isometry3, Matrix4, Vector3};
 use serde::Deserialize;
-use serde::de::DeserializeOwned;
 use std::collections::BTreeMap;
-use std::fs::File;
-use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
+use tar::{SHAPES, Tar, TarPictures};
 
 const ARIA: &str = "214-1";
 const QUEST: &str = "1201-1";
-const SHAPES: &str = "__hand_shapes.json__";
 /// Frames are 33 ms apart, and each is its own sample: a missing one is missing.
 const MAX_GAP: i64 = SECOND / 25;
 const HOLD: i64 = SECOND / 100;
-/// A hand profile with its mesh has a megabyte; nothing else in text is as large.
-const LONGEST_TEXT: u64 = 64 << 20;
-/// No picture of these cameras is larger.
-const LONGEST_PICTURE: u64 = 64 << 20;
 
 /// Opens the clips at or below `root`, which may be a single tar.
 ///
@@ -109,120 +104,6 @@ fn name_of(root: &Path, tar: &Path) -> String {
         Path::to_owned,
     );
     path.with_extension("").to_string_lossy().into_owned()
-}
-
-/// Where a member is.
-#[derive(Debug, Clone, Copy)]
-struct Member {
-    offset: u64,
-    size: u64,
-}
-
-/// The members of a frame that matter.
-#[derive(Debug, Default)]
-struct Frame {
-    pictures: BTreeMap<String, Member>,
-    cameras: Option<Member>,
-    info: Option<Member>,
-    hands: Option<Member>,
-}
-
-/// A tar: where everything is.
-struct Tar {
-    path: PathBuf,
-    file: File,
-    frames: BTreeMap<u32, Frame>,
-    shapes: Option<Member>,
-}
-
-impl Tar {
-    /// One pass over the headers, in whatever order the members are.
-    fn index(path: &Path) -> Result<Self, ReadError> {
-        let io = |cause| ReadError::io(path, cause);
-        let damaged = |offset: u64, reason: String| {
-            ReadError::malformed(path, Position::Offset(offset), reason)
-        };
-        let file = File::open(path).map_err(io)?;
-        let length = file.metadata().map_err(io)?.len();
-        let mut archive = tar::Archive::new(File::open(path).map_err(io)?);
-        let (mut frames, mut shapes) = (BTreeMap::<u32, Frame>::new(), None);
-        let mut offset = 0;
-        let entries = archive
-            .entries_with_seek()
-            .map_err(|error| damaged(0, error.to_string()))?;
-        for entry in entries {
-            let entry = entry.map_err(|error| damaged(offset, error.to_string()))?;
-            offset = entry.raw_file_position();
-            let size = entry.size();
-            if offset.checked_add(size).is_none_or(|end| end > length) {
-                let reason = format!("a member of {size} bytes in a file of {length}");
-                return Err(damaged(offset, reason));
-            }
-            let member = Member { offset, size };
-            let name = entry.path_bytes();
-            let name = String::from_utf8_lossy(&name);
-            let name = name.rsplit('/').next().unwrap_or(&name);
-            if name == SHAPES {
-                shapes = Some(member);
-            }
-            let Some((number, kind)) = name.split_once('.') else {
-                continue;
-            };
-            let Ok(number) = number.parse() else {
-                continue;
-            };
-            let frame = frames.entry(number).or_default();
-            match kind {
-                "cameras.json" => frame.cameras = Some(member),
-                "info.json" => frame.info = Some(member),
-                "hands.json" => frame.hands = Some(member),
-                _ => {
-                    let stream = kind
-                        .strip_prefix("image_")
-                        .and_then(|rest| rest.rsplit_once('.'));
-                    if let Some((stream, "jpg" | "jpeg" | "png")) = stream {
-                        frame.pictures.insert(stream.to_owned(), member);
-                    }
-                }
-            }
-        }
-        if frames.is_empty() {
-            return Err(damaged(
-                0,
-                "there are no frames of HOT3D-Clips in it".to_owned(),
-            ));
-        }
-        Ok(Tar {
-            path: path.to_owned(),
-            file,
-            frames,
-            shapes,
-        })
-    }
-
-    fn json<T: DeserializeOwned>(&self, member: Member, name: &str) -> Result<T, ReadError> {
-        let bytes = read(&self.path, &self.file, member, LONGEST_TEXT)?;
-        serde_json::from_slice(&bytes).map_err(|error| {
-            let offset = Position::Offset(member.offset);
-            ReadError::malformed(&self.path, offset, format!("`{name}`: {error}"))
-        })
-    }
-}
-
-/// The bytes of a member.
-fn read(path: &Path, mut file: &File, member: Member, most: u64) -> Result<Vec<u8>, ReadError> {
-    if member.size > most {
-        return Err(ReadError::malformed(
-            path,
-            Position::Offset(member.offset),
-            format!("a member of {} bytes", member.size),
-        ));
-    }
-    let mut bytes = vec![0; member.size as usize];
-    file.seek(SeekFrom::Start(member.offset))
-        .and_then(|_| file.read_exact(&mut bytes))
-        .map_err(|cause| ReadError::io(path, cause))?;
-    Ok(bytes)
 }
 
 #[derive(Deserialize)]
@@ -383,12 +264,12 @@ fn open(
             recording.cameras.push((time, mounted));
         }
     }
-    if !poses.is_empty() {
-        recording.device = Some(Track::new(poses, MAX_GAP, HOLD));
-    } else {
+    if poses.is_empty() {
         recording
             .notes
             .push("its frames have no pose of the camera: no camera and no hands".to_owned());
+    } else {
+        recording.device = Some(Track::new(poses, MAX_GAP, HOLD));
     }
     hands(&tar, &time, mano, model, &mut recording)?;
     pictures.sort_by_key(|(time, _)| *time);
@@ -530,30 +411,4 @@ fn by_mano(
         translation: [x, y, z],
     };
     Some(mano::joints(mano.hand(side)?, &pose, &Convention::SMPLX))
-}
-
-/// Pictures inside a tar.
-struct TarPictures {
-    path: PathBuf,
-    members: Vec<Member>,
-    times: Vec<i64>,
-}
-
-impl ColourFrames for TarPictures {
-    fn times(&self) -> &[i64] {
-        &self.times
-    }
-
-    fn read(&self, indices: &[usize], each: &mut dyn FnMut(usize, Image)) -> Result<(), ReadError> {
-        let file = File::open(&self.path).map_err(|cause| ReadError::io(&self.path, cause))?;
-        for &index in indices {
-            let member = self.members[index];
-            let bytes = read(&self.path, &file, member, LONGEST_PICTURE)?;
-            let image = Image::from_bytes(&bytes).map_err(|reason| {
-                ReadError::malformed(&self.path, Position::Offset(member.offset), reason)
-            })?;
-            each(index, image);
-        }
-        Ok(())
-    }
 }

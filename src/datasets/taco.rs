@@ -164,8 +164,11 @@ fn open(root: &Path, name: &Path, mano: Option<&Mano>) -> Result<Recording, Read
     Ok(recording)
 }
 
+/// `T_world_camera` by time in nanoseconds.
+type Poses = Vec<(i64, Isometry3<f64>)>;
+
 /// `T_world_camera` where it is finite, and how many rows there are.
-fn poses(path: &Path) -> Result<(Vec<(i64, Isometry3<f64>)>, usize), ReadError> {
+fn poses(path: &Path) -> Result<(Poses, usize), ReadError> {
     if !path.is_file() {
         return Err(ReadError::missing(path, "the camera's poses are not there"));
     }
@@ -290,11 +293,11 @@ fn hands(
     if let Some(mano) = mano
         && (0..2).any(|side| parameters(side).is_some())
     {
-        for side in 0..2 {
+        for (side, name) in sides.into_iter().enumerate() {
             let Some((poses, shape)) = parameters(side) else {
                 recording
                     .notes
-                    .push(format!("there is no `{}_hand.pkl`", sides[side]));
+                    .push(format!("there is no `{name}_hand.pkl`"));
                 continue;
             };
             let Some(model) = mano.hand(side) else {

@@ -165,9 +165,9 @@ impl ManoModel {
             .map(|joint| std::array::from_fn(|b| regressed(joint, &|k| direction(k, b))))
             .collect();
         Ok(ManoModel {
+            arrays,
             joints,
             joint_directions,
-            arrays,
         })
     }
 

@@ -4,6 +4,7 @@ use super::rules::{Plan, Rule};
 use super::{Checkpoint, ImportError, ImportOptions, cosmos, mget, tmr, vda, vq};
 use serde_json::{Map, Value, json};
 use std::collections::BTreeMap;
+use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
 /// A recognised checkpoint.
@@ -45,7 +46,7 @@ impl Source {
                 "no transformer, tokenizer, depth network or motion encoder of a known release"
                     .to_owned();
             if let Some(entry) = checkpoint.entries().first() {
-                reason += &format!("; its first tensor is called `{}`", entry.name);
+                let _ = write!(reason, "; its first tensor is called `{}`", entry.name);
             }
             Err(reason)
         };

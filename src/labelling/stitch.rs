@@ -239,9 +239,9 @@ mod tests {
                 .map(|slot| {
                     let mut values = truth(slots[slot]);
                     if relative {
-                        values
-                            .iter_mut()
-                            .for_each(|v| *v = *v * scale + 0.25 * scale - 0.25);
+                        for v in &mut values {
+                            *v = *v * scale + 0.25 * scale - 0.25;
+                        }
                     }
                     (
                         slot,

@@ -13,12 +13,12 @@ use std::sync::Arc;
 pub struct Tokenizers {
     format: ClipFormat,
     modalities: BTreeMap<String, Arc<dyn Modality>>,
-    tokenizers: BTreeMap<String, Arc<dyn Tokenizer>>,
+    by_modality: BTreeMap<String, Arc<dyn Tokenizer>>,
 }
 
 impl std::fmt::Debug for Tokenizers {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let grids = self.tokenizers.iter().map(|(name, t)| (name, t.grid()));
+        let grids = self.by_modality.iter().map(|(name, t)| (name, t.grid()));
         f.debug_map().entries(grids).finish()
     }
 }
@@ -34,7 +34,7 @@ impl Tokenizers {
         Self {
             format,
             modalities,
-            tokenizers: BTreeMap::new(),
+            by_modality: BTreeMap::new(),
         }
     }
 
@@ -45,7 +45,7 @@ impl Tokenizers {
     }
 
     pub(super) fn insert_as(&mut self, name: &str, tokenizer: Arc<dyn Tokenizer>) {
-        self.tokenizers.insert(name.to_owned(), tokenizer);
+        self.by_modality.insert(name.to_owned(), tokenizer);
     }
 
     /// The sizes of the clips.
@@ -57,19 +57,19 @@ impl Tokenizers {
     /// The modalities that have a tokenizer, in the order of their names.
     pub fn names(&self) -> impl Iterator<Item = &str> {
         let known = |name: &&String| self.knows(name);
-        self.tokenizers.keys().filter(known).map(String::as_str)
+        self.by_modality.keys().filter(known).map(String::as_str)
     }
 
     /// The tokenizer of a modality.
     #[must_use]
     pub fn get(&self, name: &str) -> Option<&dyn Tokenizer> {
-        self.tokenizers.get(name).map(AsRef::as_ref)
+        self.by_modality.get(name).map(AsRef::as_ref)
     }
 
     /// A modality that has a tokenizer.
     #[must_use]
     pub fn modality(&self, name: &str) -> Option<&dyn Modality> {
-        self.tokenizers.get(name).and_then(|_| self.known(name))
+        self.by_modality.get(name).and_then(|_| self.known(name))
     }
 
     /// A modality of the clips, with a tokenizer or without.
@@ -87,7 +87,7 @@ impl Tokenizers {
     /// When a signal has another form than the tokenizer was trained on.
     pub fn encode(&self, clip: &Clip) -> Result<BTreeMap<String, TokenGrid>, ModelError> {
         let mut tokens = BTreeMap::new();
-        for (name, tokenizer) in &self.tokenizers {
+        for (name, tokenizer) in &self.by_modality {
             let Some(modality) = self.known(name) else {
                 continue;
             };
@@ -107,7 +107,7 @@ impl Tokenizers {
     /// # Errors
     /// When a file cannot be written.
     pub fn write(&self, folder: &Path) -> Result<(), ModelError> {
-        for (name, tokenizer) in &self.tokenizers {
+        for (name, tokenizer) in &self.by_modality {
             let path = folder.join(name);
             std::fs::create_dir_all(&path).map_err(|error| ModelError::Io {
                 path: path.clone(),

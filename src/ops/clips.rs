@@ -246,7 +246,7 @@ impl Op for Clips {
             "source": name, "format": format, "splits": splits, (DEFAULTS): settings.defaults(),
         });
         if !remarks.is_empty() {
-            let list: String = remarks.iter().map(|text| format!("* {text}\n")).collect();
+            let list = format!("* {}\n", remarks.join("\n* "));
             let report = context.output().join("report");
             std::fs::create_dir_all(&report).map_err(StageError::other)?;
             std::fs::write(report.join("remarks.md"), list).map_err(StageError::other)?;

@@ -199,14 +199,12 @@ impl Wanted {
                 return Err(reader.failure(frame, missing));
             };
             if self.index.keys.is_some() {
-                match stamp.time.and_then(|time| self.index.find(time)) {
-                    Some(found) => reader.position = found,
+                let Some(found) = stamp.time.and_then(|time| self.index.find(time)) else {
                     // A picture that is none of the table's.
-                    None => {
-                        reader.skip().map_err(|why| reader.failure(frame, &why))?;
-                        continue;
-                    }
-                }
+                    reader.skip().map_err(|why| reader.failure(frame, &why))?;
+                    continue;
+                };
+                reader.position = found;
             }
             if reader.position > frame {
                 return Err(reader.failure(frame, missing));

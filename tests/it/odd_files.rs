@@ -297,7 +297,7 @@ fn wrappers_around_names_are_taken_off_and_said() {
         .unwrap_err()
         .to_string();
     assert!(
-        error.contains("body_two") && error.contains("neither a transformer"),
+        error.contains("body_two") && error.contains("no transformer"),
         "{error}"
     );
 }

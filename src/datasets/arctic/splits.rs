@@ -11,6 +11,9 @@ use ndarray::{Ix3, Ix4};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+/// Joints by time in nanoseconds.
+type Timed = Vec<(i64, Joints)>;
+
 /// What the splits say, by `<subject>/<sequence>`.
 #[derive(Debug, Default)]
 pub(super) struct Splits {
@@ -141,7 +144,7 @@ impl Split {
     }
 
     /// Joints in the head camera; the order of `smplx` is ours. Whether a hand is in the picture does not matter.
-    pub(super) fn hands(&self) -> Result<[Option<Vec<(i64, Joints)>>; 2], ReadError> {
+    pub(super) fn hands(&self) -> Result<[Option<Timed>; 2], ReadError> {
         let read = |side: usize| {
             let Some(array) = &self.joints[side] else {
                 return Ok(None);

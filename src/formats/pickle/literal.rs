@@ -13,9 +13,8 @@ pub(super) fn text_or_bytes(bytes: Vec<u8>) -> Node {
 /// The bytes of a string literal as `repr` writes it.
 pub(super) fn unquoted(line: &[u8]) -> Option<Vec<u8>> {
     let line = line.trim_ascii();
-    let inside = match line {
-        [b'\'', inside @ .., b'\''] | [b'"', inside @ .., b'"'] => inside,
-        _ => return None,
+    let ([b'\'', inside @ .., b'\''] | [b'"', inside @ .., b'"']) = line else {
+        return None;
     };
     let mut out = Vec::with_capacity(inside.len());
     let mut rest = inside.iter().copied();

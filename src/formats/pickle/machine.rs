@@ -1,7 +1,7 @@
 //! The interpreter: one pass over the opcodes, on an arena.
 
 use super::literal::{text_or_bytes, unescaped, unquoted};
-use super::objects::long;
+use super::scalars::long;
 use super::{
     CUT, Id, MAX_FILE_NODES, MAX_FILE_TEXT, MAX_LINE, MAX_NODES, MAX_SHORT, MAX_TEXT, Node,
     PickleError, StoredBytes,
@@ -179,12 +179,8 @@ impl<'a> Machine<'a> {
                     let length = self.u8()?;
                     self.payload(length.into())?;
                 }
-                // EMPTY_SET, ADDITEMS, FROZENSET
+                // EMPTY_SET, FROZENSET (ADDITEMS, 0x90, is below with APPENDS)
                 0x8f => self.push(Node::Set(Vec::new())),
-                0x90 => {
-                    let items = self.pop_mark()?;
-                    self.append(&items)?;
-                }
                 0x91 => {
                     let items = self.pop_mark()?;
                     self.push(Node::Set(items));
@@ -218,7 +214,7 @@ impl<'a> Machine<'a> {
                     let item = self.pop()?;
                     self.append(&[item])?;
                 }
-                b'e' => {
+                b'e' | 0x90 => {
                     let items = self.pop_mark()?;
                     self.append(&items)?;
                 }

@@ -13,6 +13,7 @@ mod machine;
 mod names;
 mod numbers;
 mod objects;
+mod scalars;
 mod tensor;
 
 pub use numbers::StoredArray;

@@ -1,6 +1,7 @@
 //! What a call of each name of the allow-list describes. Nothing is ever called.
 
 use super::machine::Machine;
+use super::scalars::{long, ucs4, unsigned};
 use super::{
     ArrayView, Global, Id, MAX_COPIED, MAX_COPIES, Node, PickleError, Scalar, Storage, StoredBytes,
     TensorView,
@@ -45,7 +46,11 @@ impl Machine<'_> {
             }
             (Global::Dictionary, [items]) | (Global::DefaultDict, [_, items]) => {
                 match self.node(*items) {
-                    Node::Dict(_) => return self.same(*items),
+                    // What the call gives is its argument.
+                    Node::Dict(_) => {
+                        self.stack.push(*items);
+                        return Ok(());
+                    }
                     Node::List(pairs) | Node::Tuple(pairs) => {
                         let pairs = pairs.clone();
                         self.dictionary(&pairs)?
@@ -55,9 +60,7 @@ impl Machine<'_> {
             }
             (Global::Container, []) => Node::Tuple(Vec::new()),
             (Global::Bytes, []) => Node::Bytes(Vec::new()),
-            (Global::Bytes, [text, codec]) | (Global::Encode, [text, codec]) => {
-                self.latin1(*text, *codec)?
-            }
+            (Global::Bytes | Global::Encode, [text, codec]) => self.latin1(*text, *codec)?,
             (Global::StorageFromBytes, [bytes]) => Node::Storage(self.storage_from_bytes(*bytes)?),
             (Global::Complex, [real, imaginary]) => {
                 Node::Complex(self.float(*real)?, self.float(*imaginary)?)
@@ -66,7 +69,8 @@ impl Machine<'_> {
                 Global::Parameter | Global::Container | Global::Bytes | Global::Layout,
                 [same, ..],
             ) => {
-                return self.same(*same);
+                self.stack.push(*same);
+                return Ok(());
             }
             (Global::Tensor, []) => Node::Opaque(EMPTY),
             (Global::RebuildTensor, [storage, ..])
@@ -136,12 +140,6 @@ impl Machine<'_> {
             (function, _) => return self.refuse(format!("{function:?} called in an unknown way")),
         };
         self.push(node);
-        Ok(())
-    }
-
-    /// What a call gives is one of its arguments.
-    fn same(&mut self, id: Id) -> Result<(), PickleError> {
-        self.stack.push(id);
         Ok(())
     }
 
@@ -485,34 +483,4 @@ impl Machine<'_> {
         self.copies(bytes.len())?;
         Ok(Node::Bytes(bytes))
     }
-}
-
-fn unsigned(bytes: &[u8]) -> Option<Node> {
-    let mut wide = [0; 16];
-    wide.get_mut(..bytes.len())?.copy_from_slice(bytes);
-    Some(Node::Int(i128::from_le_bytes(wide)))
-}
-
-/// Text of four bytes a character.
-fn ucs4(bytes: &[u8]) -> Option<String> {
-    let mut text = String::new();
-    for chunk in bytes.chunks(4) {
-        let code = u32::from_le_bytes(chunk.try_into().ok()?);
-        if code != 0 {
-            text.push(char::from_u32(code)?);
-        }
-    }
-    Some(text)
-}
-
-/// A little-endian two's complement integer.
-pub(super) fn long(bytes: &[u8]) -> Option<i128> {
-    let sign = if bytes.last().is_some_and(|b| b & 0x80 != 0) {
-        0xff
-    } else {
-        0
-    };
-    let mut wide = [sign; 16];
-    wide.get_mut(..bytes.len())?.copy_from_slice(bytes);
-    Some(i128::from_le_bytes(wide))
 }

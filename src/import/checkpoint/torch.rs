@@ -24,7 +24,8 @@ impl Checkpoint {
             .map(str::to_owned)
             .collect();
         let [root] = roots.as_slice() else {
-            let arrays = zip.entries().iter().all(|e| e.name.ends_with(".npy"));
+            let mut names = zip.entries().iter().map(|e| Path::new(&e.name));
+            let arrays = names.all(|name| name.extension().is_some_and(|e| e == "npy"));
             if arrays && !zip.entries().is_empty() {
                 return Err(refused("an archive of NumPy arrays (npz)".to_owned()));
             }

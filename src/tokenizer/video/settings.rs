@@ -67,7 +67,6 @@ impl VideoSettings {
             levels: vec![8, 5, 5],
             spatial: 8,
             temporal: 4,
-            ..Self::default()
         }
     }
 

@@ -426,10 +426,11 @@ mod tests {
 
     #[test]
     fn the_last_complaints_are_kept() {
-        let mut text = "[info] Input #0, mov,mp4, from 'file:x':\n".to_owned();
-        for number in 0..100 {
-            text += &format!("[h264 @ 0x1] [error] error {number}\n");
-        }
+        let lines: Vec<String> = (0..100)
+            .map(|number| format!("[h264 @ 0x1] [error] error {number}\n"))
+            .collect();
+        let head = "[info] Input #0, mov,mp4, from 'file:x':\n";
+        let text = format!("{head}{}", lines.concat());
         let (sender, _stamps) = channel();
         let said = listen(text.as_bytes(), &sender);
         assert_eq!(said.container, "mov,mp4");

@@ -101,7 +101,7 @@ impl Boxes<'_> {
             0 => be32(tables.sizes, 12 + 4 * index),
             4 => {
                 let pair = tables.sizes.get(12 + index / 2)?;
-                Some(u32::from(if index % 2 == 0 {
+                Some(u32::from(if index.is_multiple_of(2) {
                     pair >> 4
                 } else {
                     pair & 15
