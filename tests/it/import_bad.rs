@@ -2,7 +2,7 @@
 
 use crate::torch::{self, Argument};
 use proptest::prelude::*;
-use reviv::import::Checkpoint;
+use reviv::import::{Checkpoint, ImportOptions};
 use std::io::Write;
 
 /// A torch archive with this pickle and one storage of 24 bytes.
@@ -63,7 +63,11 @@ fn hostile_archives_are_refused_with_a_reason() {
     let path = folder.path().join("two.pth");
     std::fs::write(&path, archive(&two)).unwrap();
     assert_eq!(Checkpoint::open(&path).unwrap().entries().len(), 2);
-    let error = reviv::import::import(&[path], &folder.path().join("out"), &Default::default());
+    let error = reviv::import::import(
+        &[path],
+        &folder.path().join("out"),
+        &ImportOptions::default(),
+    );
     assert!(error.unwrap_err().to_string().contains("overlap"));
     assert!(
         open(b"hello, this is no checkpoint")

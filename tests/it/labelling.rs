@@ -173,7 +173,11 @@ fn the_motion_encoder_imports_alone_and_from_a_lightning_checkpoint_with_its_sta
         let file = temporary.path().join(file);
         synthesise(&table, &file, prefix);
         let folder = temporary.path().join(format!("model{}", prefix.len()));
-        let alone = import(&[file.clone()], &folder, &ImportOptions::default());
+        let alone = import(
+            std::slice::from_ref(&file),
+            &folder,
+            &ImportOptions::default(),
+        );
         let error = alone.unwrap_err().to_string();
         assert!(error.contains("mean.pt"), "{error}");
         let files: Vec<PathBuf> = [file].into_iter().chain(statistics.clone()).collect();

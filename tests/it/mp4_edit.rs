@@ -22,17 +22,16 @@ fn container(kind: [u8; 4], body: &[u8]) -> Vec<u8> {
     bytes
 }
 
+/// The new payload of a box by its number, or `None` to leave it out.
+type Change<'a> = dyn FnMut(usize, &[u8]) -> Option<Vec<u8>> + 'a;
+
 /// Replaces the payload of every box at `path`; the number of the box counts those of the same path before it.
-fn map(
-    data: &[u8],
-    path: &[&[u8; 4]],
-    change: &mut dyn FnMut(usize, &[u8]) -> Option<Vec<u8>>,
-) -> Vec<u8> {
+fn map(data: &[u8], path: &[&[u8; 4]], change: &mut Change<'_>) -> Vec<u8> {
     fn inner(
         data: &[u8],
         path: &[&[u8; 4]],
         count: &mut usize,
-        change: &mut dyn FnMut(usize, &[u8]) -> Option<Vec<u8>>,
+        change: &mut Change<'_>,
     ) -> Vec<u8> {
         let mut bytes = Vec::new();
         for (kind, body) in boxes(data) {
@@ -79,7 +78,7 @@ pub fn with_edits(file: Vec<u8>, edits: &[Edit]) -> Vec<u8> {
 }
 
 /// `a b c d` of the first track's matrix, or of the movie's.
-pub fn with_matrix(file: Vec<u8>, whose: &[u8; 4], [a, b, c, d]: [i32; 4]) -> Vec<u8> {
+pub fn with_matrix(file: Vec<u8>, whose: [u8; 4], [a, b, c, d]: [i32; 4]) -> Vec<u8> {
     let put = |body: &[u8], at: usize| {
         let mut body = body.to_vec();
         for (cell, value) in [(0, a), (1, b), (3, c), (4, d)] {
@@ -87,7 +86,7 @@ pub fn with_matrix(file: Vec<u8>, whose: &[u8; 4], [a, b, c, d]: [i32; 4]) -> Ve
         }
         Some(body)
     };
-    if whose == b"mvhd" {
+    if &whose == b"mvhd" {
         map(&file, &[b"moov", b"mvhd"], &mut |_, body| put(body, 36))
     } else {
         map(&file, &[b"moov", b"trak", b"tkhd"], &mut |_, body| {

@@ -27,10 +27,10 @@ fn said(output: &Output) -> String {
 /// Two trajectories, and a recording of camera poses.
 fn some_files(folder: &Path) {
     for name in ["a.txt", "b.txt"] {
-        let rows: String = (0..9)
+        let rows: Vec<String> = (0..9)
             .map(|k| format!("{k} {k} {} 0 0 0 0 1\n", k * k))
             .collect();
-        std::fs::write(folder.join(name), rows).unwrap();
+        std::fs::write(folder.join(name), rows.concat()).unwrap();
     }
     recording(&folder.join("recording"), |pose| pose);
 }
@@ -108,11 +108,7 @@ fn names_that_are_not_utf_8_are_names() {
     let at = |name: &[u8]| folder.path().join(odd(name));
     std::fs::rename(folder.path().join("recording"), at(b"r\xff")).unwrap();
     std::fs::rename(folder.path().join("a.txt"), at(b"a\xff.txt")).unwrap();
-    tokenizer(
-        &at(b"body\xff.safetensors"),
-        |name| name.to_owned(),
-        Form::F32,
-    );
+    tokenizer(&at(b"body\xff.safetensors"), str::to_owned, Form::F32);
     let run = |arguments: &[&[u8]]| {
         let arguments: Vec<PathBuf> = arguments.iter().map(|a| odd(a)).collect();
         reviv(folder.path()).args(arguments).output().unwrap()
@@ -340,11 +336,12 @@ fn transposed(m: [[f64; 4]; 4]) -> [[f64; 4]; 4] {
     std::array::from_fn(|r| std::array::from_fn(|c| m[c][r]))
 }
 
+type Change = fn([[f64; 4]; 4]) -> [[f64; 4]; 4];
+
 #[test]
 fn matrices_that_are_no_poses_are_refused_by_what_they_are() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("recording");
-    type Change = fn([[f64; 4]; 4]) -> [[f64; 4]; 4];
     let changes: [(Change, &str); 4] = [
         (transposed, "the fourth row of the pose is not 0 0 0 1"),
         (

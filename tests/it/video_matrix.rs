@@ -163,7 +163,7 @@ fn compare(path: &Path, decoder: DecoderChoice, by: &str) -> Result<(), String> 
     let bytes = shown(path);
     let size = info.width as usize * info.height as usize * 3;
     let count = bytes.len() / size;
-    if count == 0 || bytes.len() % size != 0 || info.frames != count {
+    if count == 0 || !bytes.len().is_multiple_of(size) || info.frames != count {
         return Err(format!(
             "{} frames of {} x {}, and ffmpeg gives {} bytes ({count} frames)",
             info.frames,
@@ -469,17 +469,17 @@ fn orientations_are_those_of_ffmpeg() {
         ("twice_as_large", [2 * one, 0, 0, 2 * one]),
     ] {
         let path = place.edited(&format!("{name}.mp4"), &base, |bytes| {
-            mp4_edit::with_matrix(bytes, b"trak", matrix)
+            mp4_edit::with_matrix(bytes, *b"trak", matrix)
         });
         place.check_both(&path);
         // The movie's own matrix turns all its tracks.
         let path = place.edited(&format!("{name}_movie.mp4"), &path, |bytes| {
-            mp4_edit::with_matrix(bytes, b"mvhd", [0, one, -one, 0])
+            mp4_edit::with_matrix(bytes, *b"mvhd", [0, one, -one, 0])
         });
         place.check_both(&path);
     }
     let path = place.edited("slanted.mp4", &base, |bytes| {
-        mp4_edit::with_matrix(bytes, b"trak", [56_756, 32_768, -32_768, 56_756])
+        mp4_edit::with_matrix(bytes, *b"trak", [56_756, 32_768, -32_768, 56_756])
     });
     place.check(&path, DecoderChoice::Auto, "ffmpeg");
     place.finish();
@@ -548,7 +548,7 @@ fn pixels_that_are_not_square_become_so() {
     );
     let stream = place.edited("vui_only.mp4", &stream, mp4_edit::without_shapes);
     let turned = place.edited("turned.mp4", &wide, |bytes| {
-        mp4_edit::with_matrix(bytes, b"trak", [0, 1 << 16, -(1 << 16), 0])
+        mp4_edit::with_matrix(bytes, *b"trak", [0, 1 << 16, -(1 << 16), 0])
     });
     for (path, size) in [
         (&wide, (85, 48)),
