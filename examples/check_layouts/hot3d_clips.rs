@@ -2,11 +2,13 @@
 
 use std::path::Path;
 
+use ndarray::Ix1;
 use reviv::datasets::open::{Dataset, HandModel, OpenWith, open};
 
 use super::Outcome;
 use super::compare::{self, Answer, Expected};
 use super::fake_mano;
+use super::golden::{Golden, golden_files};
 use super::report::Report;
 
 const UMETRACK: Expected = Expected {
@@ -17,8 +19,7 @@ const UMETRACK: Expected = Expected {
     body: &[],
     depth: 0.0,
     times_missing: None,
-    // Quest's cameras have no colour, and their luma is that of the golden colours too.
-    mono: true,
+    mono: false,
 };
 const MANO: Expected = Expected {
     left_hand: &[Answer::new("left_hand_mano", "left_hand_mano_valid", 1e-5)],
@@ -29,6 +30,14 @@ const MANO: Expected = Expected {
     )],
     ..UMETRACK
 };
+
+/// Quest's cameras have no colour; its world has y up.
+fn is_quest(golden: &Golden) -> Outcome<bool> {
+    if !golden.has("up_world") {
+        return Ok(false);
+    }
+    Ok(golden.array::<f64, Ix1>("up_world")?[1] > 0.5)
+}
 
 pub fn check(folder: &Path, report: &mut Report) -> Outcome {
     let mano = fake_mano::beside(folder);
@@ -42,12 +51,19 @@ pub fn check(folder: &Path, report: &mut Report) -> Outcome {
             hands,
             ..OpenWith::default()
         };
-        compare::check(
-            folder,
-            &|folder, cut| open(folder, Some(Dataset::Hot3dClips), cut, with),
-            &expected,
-            report,
-        )?;
+        for path in golden_files(folder)? {
+            let expected = Expected {
+                mono: is_quest(&Golden::read(&path)?)?,
+                ..expected
+            };
+            compare::check_one(
+                &path,
+                folder,
+                &|folder, cut| open(folder, Some(Dataset::Hot3dClips), cut, with),
+                &expected,
+                report,
+            )?;
+        }
     }
     Ok(())
 }

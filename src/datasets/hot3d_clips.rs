@@ -30,6 +30,8 @@ const QUEST: &str = "1201-1";
 /// Frames are 33 ms apart, and each is its own sample: a missing one is missing.
 const MAX_GAP: i64 = SECOND / 25;
 const HOLD: i64 = SECOND / 100;
+/// Nanoseconds between a frame and the tick that it counts for.
+const JITTER: u64 = 1_000_000;
 
 /// Opens the clips at or below `root`, which may be a single tar.
 ///
@@ -220,15 +222,16 @@ fn open(
         Vector3::z_axis()
     });
     // A frame without a capture time has none that would fit the others' clock, unless none has one.
-    let timed = infos
+    let first = infos
         .values()
-        .any(|info| info.image_timestamps_ns.contains_key(stream));
-    let time = |number: u32| {
-        if timed {
-            infos[&number].image_timestamps_ns.get(stream).copied()
-        } else {
-            Some(tick(number.into()))
+        .filter_map(|info| info.image_timestamps_ns.get(stream).copied())
+        .min();
+    let time = |number: u32| match first {
+        Some(first) => {
+            let time = infos[&number].image_timestamps_ns.get(stream)?;
+            Some(on_grid(first, *time))
         }
+        None => Some(tick(number.into())),
     };
 
     let mut pictures = Vec::new();
@@ -291,6 +294,18 @@ fn open(
         ));
     }
     Ok(recording)
+}
+
+/// Frames are taken 30 times a second, and their times have a jitter of some microseconds, by which nothing moves: a frame counts at
+/// its tick. One that is far from every tick keeps its own time.
+fn on_grid(first: i64, time: i64) -> i64 {
+    let nearest = ((time.saturating_sub(first)) as f64 * 30.0 / SECOND as f64).round() as i64;
+    let ticked = first.saturating_add(tick(nearest));
+    if ticked.abs_diff(time) < JITTER {
+        ticked
+    } else {
+        time
+    }
 }
 
 fn mounted(calibration: &Calibration) -> Result<MountedCamera, String> {
