@@ -239,7 +239,9 @@ fn open(
     for (number, frame) in &tar.frames {
         let Some(time) = time(*number) else { continue };
         if let Some(member) = frame.pictures.get(stream) {
-            pictures.push((time, *member));
+            // Pictures are chosen by when they were taken.
+            let taken = infos[number].image_timestamps_ns.get(stream).copied();
+            pictures.push((taken.unwrap_or(time), *member));
         }
         let Some(member) = frame.cameras else {
             continue;

@@ -1,4 +1,4 @@
-//! A folder or file of any kind as a [`Source`]: what `reviv data` and the op `clips` call when they are given a path.
+//! A folder or file of any kind as a [`ClipSource`]: what `reviv data` and the op `clips` call when they are given a path.
 
 use super::recording::{ColourFrames, CutSettings, Recording};
 use super::shards::ShardClips;

@@ -1,4 +1,4 @@
-//! Clips in shards: where [`super::convert`] puts them, and a [`Source`] that gives them back.
+//! Clips in shards: where [`super::convert`] puts them, and a [`ClipSource`] that gives them back.
 //!
 //! A folder of converted clips is `<modality>/<data set>/shard-000000.tar` with [`FILE`] beside it, which says what was asked and
 //! what became of it. An artifact of the op `clips` holds such folders by split, and is read as one.

@@ -1,4 +1,4 @@
-//! A stretch of the built-in world as a [`Source`].
+//! A stretch of the built-in world as a [`ClipSource`].
 
 use super::World;
 use crate::clip::clock::SIGNAL_RATE;

@@ -1,7 +1,7 @@
 //! The motion encoder behind the FID and the similarity of motions (Table 2): TMR, whose weights a user brings.
 //!
 //! Joints of a clip become 22 joints with y up ([`skeleton`]), are resampled ([`resample`]), turned into 263 numbers per frame
-//! step ([`features`]) and embedded by a transformer ([`encoder`]); [`stored`] is the folder that `reviv import` makes, and this
+//! step ([`mod@features`]) and embedded by a transformer ([`encoder`]); [`stored`] is the folder that `reviv import` makes, and this
 //! file the whole chain. Features and their errors are those of the code the weights were trained with, quirks included; each is
 //! named where it is. All geometry is f64.
 
