@@ -1,6 +1,7 @@
 //! ARCTIC, TACO, H2O and HOT3D-Clips with files that are empty, cut off, of another kind or flipped: one sentence that names the file,
 //! never a panic; and without files: the rest of their signals, and a note that says what to supply.
 
+use crate::layouts_bad::{copy, files};
 use proptest::prelude::*;
 use reviv::datasets::ClipSource;
 use reviv::datasets::open::{Dataset, OpenWith, open};
@@ -14,36 +15,6 @@ const SETS: [(&str, Dataset); 4] = [
     ("h2o", Dataset::H2o),
     ("hot3d_clips", Dataset::Hot3dClips),
 ];
-
-fn copy(from: &Path, to: &Path) {
-    std::fs::create_dir_all(to).unwrap();
-    for entry in std::fs::read_dir(from).unwrap() {
-        let path = entry.unwrap().path();
-        let target = to.join(path.file_name().unwrap());
-        if path.is_dir() {
-            copy(&path, &target);
-        } else if !target.to_string_lossy().contains("golden") {
-            std::fs::write(&target, std::fs::read(&path).unwrap()).unwrap();
-        }
-    }
-}
-
-fn files(folder: &Path) -> Vec<PathBuf> {
-    let mut found = Vec::new();
-    let mut folders = vec![folder.to_owned()];
-    while let Some(folder) = folders.pop() {
-        for entry in std::fs::read_dir(folder).unwrap() {
-            let path = entry.unwrap().path();
-            if path.is_dir() {
-                folders.push(path);
-            } else {
-                found.push(path);
-            }
-        }
-    }
-    found.sort();
-    found
-}
 
 /// One file of each kind: the first of a folder of many.
 fn kinds(root: &Path) -> Vec<PathBuf> {
