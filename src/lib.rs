@@ -67,18 +67,8 @@ pub mod masking;
 pub mod mget;
 pub mod tokenizer;
 
-pub mod clip;
-pub mod datasets;
-pub mod modality;
-pub mod video;
-pub mod world;
-
-pub mod engine;
-pub mod flow;
-pub mod formats;
-pub mod geometry;
-pub mod nn;
-pub mod random;
+pub use reviv_data::{clip, datasets, flow, formats, geometry, modality, random, video, world};
+pub use reviv_engine::{engine, nn, parameters};
 
 pub use clip::source::ClipSource;
 pub use engine::Compute;

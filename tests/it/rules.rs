@@ -22,6 +22,9 @@ const FLOORS: &[&[&str]] = &[
     &["nn", "engine", "geometry", "formats", "random", "flow"],
 ];
 
+/// Where the rooms are: those of the program, and the two floors that are crates of their own.
+const SOURCES: [&str; 3] = ["src", "crates/data/src", "crates/engine/src"];
+
 /// The framework knows no model: beside itself it may use nothing but these.
 const FRAMEWORK_USES: &[&str] = &["experiment", "run", "formats", "random"];
 
@@ -49,9 +52,11 @@ impl File {
         code.map(|(at, line)| (at, line.split("//").next().unwrap_or("")))
     }
 
-    /// `run` for `src/run/cache.rs`.
+    /// `run` for `src/run/cache.rs`, `clip` for `crates/data/src/clip/mod.rs`.
     fn room(&self) -> Option<&str> {
-        let inside = self.name.strip_prefix("src/")?;
+        let inside = SOURCES
+            .iter()
+            .find_map(|folder| self.name.strip_prefix(folder)?.strip_prefix('/'))?;
         let room = inside.split('/').next()?;
         Some(room.strip_suffix(".rs").unwrap_or(room))
     }
@@ -84,10 +89,15 @@ fn files(folder: &str) -> Vec<File> {
     found
 }
 
-/// Every line of `src/` outside tests that breaks a rule.
+/// Every source file of the rooms.
+fn sources() -> Vec<File> {
+    SOURCES.iter().flat_map(|folder| files(folder)).collect()
+}
+
+/// Every line of the rooms outside tests that breaks a rule.
 fn broken(breaks: impl Fn(&File, &str) -> Option<String>) -> Vec<String> {
     let mut lines = Vec::new();
-    let sources = files("src");
+    let sources = sources();
     assert!(sources.len() > 20, "the sources were not found");
     for file in &sources {
         for (at, line) in file.code() {
@@ -132,7 +142,7 @@ fn arrows_between_rooms_point_down_only() {
 
 #[test]
 fn every_room_has_its_floor() {
-    for file in files("src") {
+    for file in sources() {
         let room = file.room().unwrap().to_owned();
         assert!(
             ["lib", "main"].contains(&room.as_str()) || floor(&room).is_some(),
@@ -145,7 +155,7 @@ fn every_room_has_its_floor() {
 #[test]
 fn a_file_holds_one_idea() {
     let mut long = Vec::new();
-    for file in ["src", "tests", "examples", "benches"]
+    for file in ["src", "crates", "tests", "examples", "benches"]
         .iter()
         .flat_map(|folder| files(folder))
     {
@@ -168,7 +178,7 @@ fn a_file_holds_one_idea() {
 
 #[test]
 fn every_module_says_what_it_is() {
-    let silent: Vec<String> = files("src")
+    let silent: Vec<String> = sources()
         .into_iter()
         .filter(|file| file.name != "src/main.rs" && !file.text.starts_with("//!"))
         .map(|file| file.name)
@@ -275,8 +285,9 @@ fn every_shipped_experiment_checks_and_plans() {
 
 /// Files and folders of the package that a page names between backticks; `file::name` names a test in it.
 fn named(page: &str) -> impl Iterator<Item = (&str, Option<&str>)> {
-    const FOLDERS: [&str; 7] = [
+    const FOLDERS: [&str; 8] = [
         "src/",
+        "crates/",
         "registry/",
         "experiments/",
         "tests/",
@@ -343,13 +354,17 @@ fn the_map_of_the_paper_has_every_room_of_science_and_every_quoted_section() {
     let page = std::fs::read_to_string(root.join("docs/paper.md")).unwrap();
     let mut missing: Vec<String> = Vec::new();
     for room in FLOORS[3..].iter().copied().flatten() {
-        let inside = format!("src/{room}/");
-        let alone = format!("src/{room}.rs");
-        if !named(&page).any(|(path, _)| path.starts_with(&inside) || path == alone) {
+        let here = |path: &str| {
+            SOURCES.iter().any(|folder| {
+                path.starts_with(&format!("{folder}/{room}/"))
+                    || path == format!("{folder}/{room}.rs")
+            })
+        };
+        if !named(&page).any(|(path, _)| here(path)) {
             missing.push(format!("the room `{room}`"));
         }
     }
-    for file in files("src") {
+    for file in sources() {
         for part in quoted(&file.text) {
             if !page.contains(&part) {
                 missing.push(format!("{part}, quoted in {}", file.name));

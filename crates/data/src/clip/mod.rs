@@ -40,7 +40,7 @@ pub const BODY: Key<'static, JointTrack> = Key::new("body");
 /// Two seconds of one wearer, from any source: by modality what is known of it.
 ///
 /// ```
-/// use reviv::clip::{Clip, GAZE, GazeTrack, Key, Signal};
+/// use reviv_data::clip::{Clip, GAZE, GazeTrack, Key, Signal};
 /// use ndarray::{Array1, Array2, ArrayD};
 ///
 /// let mut clip = Clip::empty("walk/000000", "walk");

@@ -245,7 +245,7 @@ fn member_error(entry: &ZipEntry, error: std::io::Error) -> FormatError {
 }
 
 /// The error for a name that is not there, with the first few that are.
-pub(crate) fn missing<'a>(name: &str, present: impl Iterator<Item = &'a str>) -> FormatError {
+pub fn missing<'a>(name: &str, present: impl Iterator<Item = &'a str>) -> FormatError {
     let mut names: Vec<&str> = present.take(9).collect();
     if names.len() > 8 {
         names[8] = "...";

@@ -16,9 +16,9 @@ pub type StreamRng = ChaCha8Rng;
 ///
 /// ```
 /// use rand::RngExt;
-/// let mut rng = reviv::random::stream(0, "masking.input", 7, 3);
+/// let mut rng = reviv_data::random::stream(0, "masking.input", 7, 3);
 /// let value: f64 = rng.random();
-/// assert_eq!(value, reviv::random::stream(0, "masking.input", 7, 3).random::<f64>());
+/// assert_eq!(value, reviv_data::random::stream(0, "masking.input", 7, 3).random::<f64>());
 /// ```
 #[must_use]
 pub fn stream(seed: u64, name: &str, step: u64, sample: u64) -> StreamRng {

@@ -52,7 +52,7 @@ pub enum FormatError {
 }
 
 impl FormatError {
-    pub(crate) fn malformed(format: &'static str, offset: u64, reason: impl Into<String>) -> Self {
+    pub fn malformed(format: &'static str, offset: u64, reason: impl Into<String>) -> Self {
         Self::Malformed {
             format,
             offset,
@@ -60,7 +60,7 @@ impl FormatError {
         }
     }
 
-    pub(crate) fn in_file(self, path: &Path) -> Self {
+    pub fn in_file(self, path: &Path) -> Self {
         match self {
             Self::File { .. } => self,
             source => Self::File {
@@ -75,7 +75,7 @@ impl FormatError {
 ///
 /// # Errors
 /// When it cannot be read, is no regular file, or has more than `limit` bytes.
-pub(crate) fn read_whole(path: &Path, limit: u64) -> Result<Vec<u8>, FormatError> {
+pub fn read_whole(path: &Path, limit: u64) -> Result<Vec<u8>, FormatError> {
     use std::io::Read;
     let read = || {
         // Before it is opened: that of a pipe would wait for somebody who writes.
@@ -106,7 +106,7 @@ pub(crate) fn read_whole(path: &Path, limit: u64) -> Result<Vec<u8>, FormatError
 }
 
 /// The SHA-256 of a file, in hexadecimal.
-pub(crate) fn sha256_of(path: &Path) -> std::io::Result<String> {
+pub fn sha256_of(path: &Path) -> std::io::Result<String> {
     use sha2::{Digest, Sha256};
     use std::fmt::Write as _;
     use std::io::Read as _;
@@ -128,21 +128,21 @@ pub(crate) fn sha256_of(path: &Path) -> std::io::Result<String> {
 }
 
 /// Whether a path that a file names stays below the folder it is joined to: neither absolute nor with `..`.
-pub(crate) fn stays_inside(path: &Path) -> bool {
+pub fn stays_inside(path: &Path) -> bool {
     use std::path::Component;
     let plain = |part| matches!(part, Component::Normal(_) | Component::CurDir);
     !path.as_os_str().is_empty() && path.components().all(plain)
 }
 
 /// Whether a text that a file gives can be the name of a file or a folder anywhere: one part, without separators of any system.
-pub(crate) fn is_plain_name(name: &str) -> bool {
+pub fn is_plain_name(name: &str) -> bool {
     let odd = |c: char| c.is_control() || matches!(c, '/' | '\\');
     !matches!(name, "" | "." | "..") && name.len() <= 200 && !name.contains(odd)
 }
 
 /// A temporary file in `folder` that will be renamed, with the rights that a file made in place would have: the process's umask
 /// applies, where the default of `tempfile` would hide the file from colleagues.
-pub(crate) fn temporary_in(folder: &Path) -> std::io::Result<tempfile::NamedTempFile> {
+pub fn temporary_in(folder: &Path) -> std::io::Result<tempfile::NamedTempFile> {
     let mut builder = tempfile::Builder::new();
     #[cfg(unix)]
     {
@@ -153,7 +153,7 @@ pub(crate) fn temporary_in(folder: &Path) -> std::io::Result<tempfile::NamedTemp
 }
 
 /// Writes `bytes` to a temporary name beside `path` and renames it, so that a reader never sees half a file.
-pub(crate) fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), FormatError> {
+pub fn write_atomically(path: &Path, bytes: &[u8]) -> Result<(), FormatError> {
     use std::io::Write;
     let folder = path
         .parent()
