@@ -5,7 +5,7 @@
 //!
 //! ```
 //! #[global_allocator]
-//! static MEMORY: reviv_engine::engine::memory::Pool = reviv::engine::memory::Pool;
+//! static MEMORY: reviv_engine::engine::memory::Pool = reviv_engine::engine::memory::Pool;
 //! # fn main() {}
 //! ```
 //!
