@@ -4,7 +4,8 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use reviv::decoding::filter::{Filter, Sampling, TopK, kept_tokens};
-use reviv::decoding::generate::{Checks, StepTrace, generate_checked};
+use reviv::decoding::generate::generate_checked;
+use reviv::decoding::generated::{Checks, StepTrace};
 use reviv::decoding::plan::plan;
 use reviv::decoding::schedule::{TemperatureSchedule, TokenSchedule, cosine, linear};
 use reviv::decoding::settings::{Order, Scheme, TargetChanges};

@@ -11,9 +11,9 @@ use crate::evaluation::tum::{self, TimedPoses};
 use crate::experiment::catalog::Catalog;
 use crate::experiment::load;
 use crate::geometry::alignment::Freedom;
+use crate::run::Cache;
 use crate::run::RunDirectory;
 use crate::run::cache::Key;
-use crate::run::execute::cache_of;
 use crate::run::files::read_json;
 use crate::run::schedule::Schedule;
 use std::collections::BTreeMap;
@@ -225,7 +225,7 @@ pub fn entrants_of(path: &Path, runs: &Path, columns: &[String]) -> Result<Vec<M
         RunDirectory::named(runs, path).map_err(|error| Failure::input(error.to_string(), ""))?;
     let schedule: Schedule = read_json(&run.path().join("plan.json"))
         .map_err(|error| Failure::input(error.to_string(), ""))?;
-    let cache = cache_of(run.runs());
+    let cache = Cache::of(run.runs());
     let is_scores = |key| {
         schedule
             .works

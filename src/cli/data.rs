@@ -16,9 +16,9 @@ use crate::datasets::shards::{Folder, Header};
 use crate::datasets::{ClipSource, ReadError};
 use crate::experiment::catalog::Catalog;
 use crate::experiment::data::roots;
-use crate::experiment::load;
 use crate::experiment::registry::Registry;
 use crate::experiment::source::Sources;
+use crate::experiment::{files, load};
 use crate::formats::text::of_path;
 use crate::ops::clips::SourceSettings;
 use crate::video::DecoderChoice;
@@ -147,7 +147,7 @@ impl Cut {
 fn source_entry(name: &str) -> Result<SourceSettings, Failure> {
     let catalog = Catalog::linked();
     let here = Path::new("./x");
-    let registry = Registry::new(&catalog, load::beside(here, "registry").as_deref());
+    let registry = Registry::new(&catalog, files::beside(here, "registry").as_deref());
     let Some(text) = registry.text("source", name) else {
         let names = registry.names("source").join(", ");
         return Err(Failure::input(

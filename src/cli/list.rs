@@ -2,7 +2,7 @@
 
 use super::terminal::{Failure, Terminal};
 use crate::experiment::catalog::Catalog;
-use crate::experiment::load::beside;
+use crate::experiment::files::beside;
 use crate::experiment::registry::Registry;
 use crate::run::RunDirectory;
 use serde::Serialize;

@@ -7,9 +7,11 @@ use crate::experiment::catalog::Catalog;
 use crate::experiment::load::Request;
 use crate::reconstruction::folder::{FOLDER, Manifest, PAGE};
 use crate::reconstruction::predictions::ScaleStatus;
-use crate::run::execute::{Job, Outcome, cache_of, execute};
+use crate::run::execute::{Job, Outcome, execute};
 use crate::run::schedule::Schedule;
-use crate::run::{Interrupt, RunDirectory, RunError, Shard, State, WorkerPool, files, metrics};
+use crate::run::{
+    Cache, Interrupt, RunDirectory, RunError, Shard, State, WorkerPool, files, metrics,
+};
 use crate::video::DecoderChoice;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
@@ -250,7 +252,7 @@ fn text(path: &Path) -> Result<String, Failure> {
 /// The model that a run trained, or used: the last one of its plan that is in the cache.
 fn model_of(run: &RunDirectory) -> Option<PathBuf> {
     let schedule: Schedule = files::read_json(&run.path().join("plan.json")).ok()?;
-    let cache = cache_of(run.runs());
+    let cache = Cache::of(run.runs());
     let models = schedule
         .works
         .iter()

@@ -3,7 +3,7 @@
 use super::terminal::{Failure, Terminal};
 use crate::experiment::catalog::Catalog;
 use crate::experiment::docs::{self, Setting};
-use crate::experiment::load::beside;
+use crate::experiment::files::beside;
 use crate::experiment::registry::{Registry, noun};
 use crate::run::RunDirectory;
 use crate::run::report::TABLE;

@@ -3,7 +3,7 @@
 use super::run::{RunsDir, find, tell};
 use super::terminal::{Failure, Terminal};
 use crate::reconstruction::folder::{FOLDER, PAGE};
-use crate::run::execute::cache_of;
+use crate::run::Cache;
 use crate::run::files;
 use crate::run::schedule::Schedule;
 use std::path::PathBuf;
@@ -52,7 +52,7 @@ impl View {
         let run = find(terminal, &self.place.runs, &self.run)?;
         let schedule: Schedule = files::read_json(&run.path().join("plan.json"))
             .map_err(|error| tell(terminal, &error))?;
-        let cache = cache_of(run.runs());
+        let cache = Cache::of(run.runs());
         let pages: Vec<PathBuf> = schedule
             .works
             .iter()

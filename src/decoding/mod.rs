@@ -6,6 +6,7 @@
 
 pub mod filter;
 pub mod generate;
+pub mod generated;
 pub mod mget;
 pub mod model;
 pub mod plan;
@@ -13,7 +14,8 @@ mod round;
 pub mod schedule;
 pub mod settings;
 
-pub use generate::{Generated, GeneratedTokens, generate, generate_samples};
+pub use generate::{generate, generate_samples};
+pub use generated::{Generated, GeneratedTokens};
 pub use mget::MgetTokens;
 pub use model::{DecodingError, Sample, Slot, TokenModality, TokenModel};
 pub use settings::DecodingSettings;

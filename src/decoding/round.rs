@@ -1,7 +1,7 @@
 //! **The loop**: encode what is known, decode what is open, decide some of it, repeat (Supp. C).
 
 use super::filter::{Pick, pick};
-use super::generate::{Checks, Generated, GeneratedTokens, StepTrace};
+use super::generated::{Checks, Generated, GeneratedTokens, StepTrace};
 use super::model::{DecodingError, Sample, Slot, TargetPositions, TokenModel};
 use super::plan::{Chain, Group, Target};
 use super::settings::Scheme;

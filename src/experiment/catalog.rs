@@ -92,7 +92,7 @@ impl Catalog {
             })
             .collect();
         let compare = generator
-            .subschema_for::<super::graph::Compare>()
+            .subschema_for::<super::compare::Compare>()
             .to_value();
         let mut definitions = serde_json::Map::new();
         definitions.extend(generator.take_definitions(true));
@@ -145,38 +145,5 @@ impl Catalog {
     /// Shipped experiments: path and text.
     pub fn experiments(&self) -> &'static [(&'static str, &'static str)] {
         self.experiments
-    }
-
-    /// Keys of a stage that mean two things, and whose: a plug-in whose op has the name of another, or whose setting has the
-    /// name of an input of its own.
-    pub fn clashes(&self) -> Vec<String> {
-        let names = self
-            .ops
-            .windows(2)
-            .filter(|pair| pair[0].name() == pair[1].name())
-            .map(|pair| {
-                let name = pair[0].name();
-                format!("two ops named `{name}` are linked into this binary")
-            });
-        let mut clashes: Vec<String> = names.collect();
-        for op in &self.ops {
-            let mut taken = vec!["op", "seed"];
-            taken.extend(op.inputs().iter().map(|port| port.name));
-            let mut settings: Vec<String> = self
-                .schema(op.name())
-                .map(|schema| super::docs::settings(self, schema))
-                .unwrap_or_default()
-                .into_iter()
-                .filter_map(|setting| setting.key.split('.').next().map(str::to_owned))
-                .collect();
-            settings.dedup();
-            for key in settings.iter().filter(|key| taken.contains(&key.as_str())) {
-                let name = op.name();
-                clashes.push(format!(
-                    "op `{name}` has a setting `{key}`, and `{key}` is an input or a key of every stage"
-                ));
-            }
-        }
-        clashes
     }
 }

@@ -2,7 +2,7 @@
 
 use super::catalog::Catalog;
 use super::diagnostic::{Diagnostic, Span};
-use super::load::{canonical, read_bytes};
+use super::files::{canonical, read_bytes};
 use super::merge;
 use super::names;
 use super::problem::Code;

@@ -1,7 +1,7 @@
 //! Where data sets lie: `data.yaml` beside the experiment, and `REVIV_DATA_<NAME>` over it. Nowhere else.
 
 use super::diagnostic::Diagnostic;
-use super::load::{beside, read_bytes};
+use super::files::{beside, read_bytes};
 use super::problem::Code;
 use super::source::{Origin, Source, Sources};
 use super::yaml;

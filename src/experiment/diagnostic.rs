@@ -5,33 +5,9 @@
 
 use super::problem::Code;
 use super::source::Sources;
+pub use super::source::Span;
 use annotate_snippets::{AnnotationKind, Level, Renderer, Snippet, renderer::DecorStyle};
 use serde::Serialize;
-
-/// A range of bytes in one layer.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
-pub struct Span {
-    /// Index of the layer.
-    pub layer: u32,
-    pub start: u32,
-    pub end: u32,
-}
-
-impl Span {
-    /// Bytes `start..end` of a layer.
-    pub fn new(layer: u32, start: usize, end: usize) -> Self {
-        Self {
-            layer,
-            start: start as u32,
-            end: end as u32,
-        }
-    }
-
-    /// A place without extent.
-    pub fn point(layer: u32, at: usize) -> Self {
-        Self::new(layer, at, at)
-    }
-}
 
 /// One error or warning.
 #[derive(Debug, Clone, PartialEq)]

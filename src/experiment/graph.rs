@@ -1,11 +1,10 @@
 //! The typed graph that an experiment becomes: stages with complete settings, edges, and what identifies them.
 
 use super::artifact::Description;
+pub use super::compare::{Compare, Interval, Resample};
 use super::source::Sources;
 use super::stage::{AnyOp, DataInput, FileInput, InputFacts, Inputs, StagePlan};
 use super::typed::Trace;
-use schemars::JsonSchema;
-use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::fmt;
@@ -204,50 +203,6 @@ impl fmt::Display for ArtifactKey {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(self.0.to_hex().as_str())
     }
-}
-
-/// How the cells of a sweep become a table: the `compare:` block.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema, Default)]
-#[serde(deny_unknown_fields, default)]
-pub struct Compare {
-    /// The arm that the others are compared with.
-    pub baseline: Option<String>,
-    /// Metric columns, in order; all where empty.
-    pub columns: Vec<String>,
-    /// Confidence intervals.
-    pub interval: Interval,
-    /// Published rows to print beside: an entry of `reviv list published`.
-    pub against: Option<String>,
-}
-
-/// Confidence intervals of a comparison.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields, default)]
-pub struct Interval {
-    /// The share of the distribution inside the interval.
-    #[schemars(range(min = 0.5, max = 0.9999))]
-    pub level: f64,
-    /// What is resampled, paired between arms.
-    pub over: Vec<Resample>,
-}
-
-impl Default for Interval {
-    fn default() -> Self {
-        Self {
-            level: 0.95,
-            over: vec![Resample::Seeds, Resample::Clips],
-        }
-    }
-}
-
-/// What an interval resamples.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "snake_case")]
-pub enum Resample {
-    /// Training seeds.
-    Seeds,
-    /// Evaluation clips.
-    Clips,
 }
 
 /// JSON with sorted keys: the same value, the same text.

@@ -1,9 +1,11 @@
 //! From a path to an [`Experiment`]: reads the layers, composes them, opens a sweep into its cells and resolves each.
 
 use super::catalog::{Catalog, KindFacts};
+use super::clashes::clashes;
 use super::compose::Composer;
 use super::data;
 use super::diagnostic::{Diagnostic, Report, Span};
+use super::files::{beside, canonical, read};
 use super::graph::{Cell, Experiment};
 use super::problem::Code;
 use super::registry::Registry;
@@ -11,9 +13,7 @@ use super::resolve::Resolver;
 use super::source::{Origin, Source, Sources};
 use super::sweep;
 use super::typed::Validator;
-use super::yaml::{self, Node};
 use std::collections::BTreeMap;
-use std::io::Read as _;
 use std::path::{Path, PathBuf};
 
 /// What to load, and what to change in it.
@@ -187,7 +187,7 @@ fn build(
         diagnostics
             .push(Diagnostic::new(Code::E0205, Span::point(layer, 0), message.clone()).help(*help));
     }
-    for clash in catalog.clashes() {
+    for clash in clashes(catalog) {
         diagnostics.push(Diagnostic::new(Code::E0205, plan.name_span, clash));
     }
     let data = data::roots(&request.path, environment, sources, diagnostics);
@@ -242,70 +242,4 @@ fn build(
             .collect(),
         sources: Sources::default(),
     })
-}
-
-/// The nearest `name` beside a file: in its folder, or in the folder above it.
-pub fn beside(path: &Path, name: &str) -> Option<PathBuf> {
-    let folder = match path.parent() {
-        Some(folder) if !folder.as_os_str().is_empty() => folder.to_owned(),
-        _ => PathBuf::from("."),
-    };
-    let near = folder.join(name);
-    if near.exists() {
-        return Some(near);
-    }
-    let above = std::fs::canonicalize(&folder).ok()?.parent()?.join(name);
-    if !above.exists() {
-        return None;
-    }
-    // Keep what people read short.
-    let short = folder.parent().map(|parent| parent.join(name));
-    match short {
-        Some(short) if short.exists() && !folder.ends_with(".") => Some(short),
-        _ => Some(above),
-    }
-}
-
-/// A name for a file that is the same however it is written.
-pub fn canonical(path: &Path) -> PathBuf {
-    std::fs::canonicalize(path).unwrap_or_else(|_| path.to_owned())
-}
-
-/// Reads a small text file: bounded, never from a pipe or a device.
-///
-/// # Errors
-/// When it is missing, no regular file, too large or not UTF-8.
-pub fn read(path: &Path) -> std::io::Result<String> {
-    let bytes = read_bytes(path)?;
-    yaml::decode(&bytes, 0)
-        .map(std::borrow::Cow::into_owned)
-        .map_err(|diagnostic| std::io::Error::other(diagnostic.message))
-}
-
-/// Reads at most one byte more than an experiment may have.
-///
-/// # Errors
-/// When it is missing or no regular file.
-pub fn read_bytes(path: &Path) -> std::io::Result<Vec<u8>> {
-    let facts = std::fs::metadata(path)?;
-    if facts.is_dir() {
-        return Err(std::io::Error::other("it is a folder"));
-    }
-    if !facts.is_file() {
-        return Err(std::io::Error::other("it is no regular file"));
-    }
-    let mut bytes = Vec::new();
-    std::fs::File::open(path)?
-        .take(yaml::MAX_BYTES as u64 + 1)
-        .read_to_end(&mut bytes)?;
-    Ok(bytes)
-}
-
-/// The text of a scalar, whatever its type: names may look like numbers.
-pub fn scalar(node: &Node) -> Option<String> {
-    match &node.data {
-        yaml::Data::Text(text) => Some(text.clone()),
-        yaml::Data::Int(_) | yaml::Data::Float(_) | yaml::Data::Bool(_) => Some(node.inline()),
-        _ => None,
-    }
 }

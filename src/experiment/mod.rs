@@ -7,6 +7,8 @@
 
 pub mod artifact;
 pub mod catalog;
+pub mod clashes;
+mod compare;
 mod compose;
 pub mod context;
 pub mod data;
@@ -14,6 +16,7 @@ pub mod diagnostic;
 pub mod docs;
 pub mod entry;
 mod external_inputs;
+pub mod files;
 pub mod graph;
 mod interpolate;
 pub mod load;

@@ -327,7 +327,7 @@ fn project(folder: &Path) -> Vec<(EntryText, Option<String>)> {
                 .extension()
                 .is_some_and(|extension| extension == "yaml" || extension == "yml")
             {
-                let (text, unread) = match super::load::read(&path) {
+                let (text, unread) = match super::files::read(&path) {
                     Ok(text) => (text, None),
                     Err(reason) => (String::new(), Some(format!("cannot be read: {reason}"))),
                 };

@@ -1,8 +1,32 @@
 //! The texts an experiment is made of: files, registry entries, `--set` arguments, each with its name and its role.
 
-use super::diagnostic::Span;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
+
+/// A range of bytes in one layer.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Span {
+    /// Index of the layer.
+    pub layer: u32,
+    pub start: u32,
+    pub end: u32,
+}
+
+impl Span {
+    /// Bytes `start..end` of a layer.
+    pub fn new(layer: u32, start: usize, end: usize) -> Self {
+        Self {
+            layer,
+            start: start as u32,
+            end: end as u32,
+        }
+    }
+
+    /// A place without extent.
+    pub fn point(layer: u32, at: usize) -> Self {
+        Self::new(layer, at, at)
+    }
+}
 
 /// How a text came to take part.
 #[derive(Debug, Clone, PartialEq, Eq)]

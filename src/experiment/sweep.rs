@@ -2,12 +2,11 @@
 
 use super::compose::Composer;
 use super::diagnostic::{Diagnostic, Span};
-use super::load::scalar;
 use super::merge;
 use super::names;
 use super::problem::Code;
 use super::source::Origin;
-use super::yaml::{Data, Item, Node};
+use super::yaml::{Data, Item, Node, scalar};
 
 /// More runs than anybody waits for.
 const MAX_CELLS: usize = 4096;

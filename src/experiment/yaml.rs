@@ -184,3 +184,12 @@ impl Node {
         }
     }
 }
+
+/// The text of a scalar, whatever its type: names may look like numbers.
+pub fn scalar(node: &Node) -> Option<String> {
+    match &node.data {
+        Data::Text(text) => Some(text.clone()),
+        Data::Int(_) | Data::Float(_) | Data::Bool(_) => Some(node.inline()),
+        _ => None,
+    }
+}

@@ -143,6 +143,11 @@ pub struct Cache {
 }
 
 impl Cache {
+    /// The cache of a directory of runs.
+    pub fn of(runs: &Path) -> Self {
+        Self::new(runs.join("cache"))
+    }
+
     pub fn new(root: impl Into<PathBuf>) -> Self {
         Self { root: root.into() }
     }

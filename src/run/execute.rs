@@ -6,31 +6,16 @@
 use super::cache::{Cache, Entry, Key};
 use super::error::RunError;
 use super::inputs::Fingerprints;
-use super::interrupt::Interrupt;
-use super::progress::{Progress, duration};
-use super::record::{Owned, RunDirectory, Shard, State};
+pub use super::job::Job;
+use super::progress::duration;
+use super::record::{Owned, RunDirectory, State};
 use super::schedule::{Schedule, Task};
 use super::stage::{self, Surroundings};
-use super::worker_pool::{Ended, WorkerPool};
+use super::worker_pool::Ended;
 use super::{gc, provenance, report};
-use crate::experiment::Experiment;
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::atomic::{AtomicUsize, Ordering};
-
-/// What to run, and how.
-pub struct Job<'a> {
-    pub experiment: &'a Experiment,
-    /// The directory of runs; the cache lies in it.
-    pub runs: &'a Path,
-    /// Only this stage, and what it needs.
-    pub only: Option<&'a str>,
-    pub shard: Shard,
-    /// How many stages at once.
-    pub crew: WorkerPool,
-    pub progress: &'a Progress,
-    pub interrupt: &'a Interrupt,
-}
 
 /// What became of it.
 #[derive(Debug)]
@@ -56,14 +41,9 @@ fn artifacts(schedule: &Schedule, cache: &Cache) -> BTreeMap<String, PathBuf> {
         .collect()
 }
 
-/// Where the cache of a directory of runs is.
-pub fn cache_of(runs: &Path) -> Cache {
-    Cache::new(runs.join("cache"))
-}
-
 /// Runs an experiment. An error means that the run could not be begun; what fails later is in the [`Outcome`].
 pub fn execute(job: &Job<'_>) -> Result<Outcome, RunError> {
-    let cache = cache_of(job.runs);
+    let cache = Cache::of(job.runs);
     let prints = Fingerprints::remembered(&cache).watched(job.progress, job.interrupt);
     let schedule = Schedule::of(job.experiment, prints)?;
     let targets = schedule.targets(job.only, job.shard)?;

@@ -1,8 +1,7 @@
 //! Prunes the cache: what no run directory refers to, what is damaged, and what killed processes left behind.
 
-use super::cache::Key;
+use super::cache::{Cache, Key};
 use super::error::{AtPath, Holder, RunError};
-use super::execute::cache_of;
 use super::files;
 use super::interrupt::Interrupt;
 use super::lock::{Lock, Mode};
@@ -48,7 +47,7 @@ pub struct Options {
 
 /// Prunes the cache of `runs`. An artifact stays as long as a run directory refers to it: delete the run's directory first.
 pub fn prune(runs: &Path, options: Options) -> Result<Pruned, RunError> {
-    let cache = cache_of(runs);
+    let cache = Cache::of(runs);
     let mut pruned = Pruned::default();
     if !runs.is_dir() {
         return Ok(pruned);

@@ -20,6 +20,7 @@ pub mod files;
 pub mod gc;
 pub mod inputs;
 pub mod interrupt;
+mod job;
 pub mod lock;
 mod markdown;
 pub mod metrics;

@@ -3,8 +3,8 @@
 
 use super::environment::{Environment, now_text};
 use super::error::RunError;
-use super::execute::Job;
 use super::files;
+use super::job::Job;
 use super::record::RunDirectory;
 use super::schedule::{FilePlan, Schedule};
 use crate::experiment::resolved;

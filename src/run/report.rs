@@ -8,7 +8,6 @@ use super::cache::{Cache, Key};
 use super::curves::{self, Curve};
 use super::environment;
 use super::error::{AtPath, RunError};
-use super::execute::cache_of;
 use super::files;
 use super::markdown::{escape, html};
 use super::metrics;
@@ -36,7 +35,7 @@ const MOST_PLOTS: usize = 60;
 pub fn write(directory: &RunDirectory) -> Result<(), RunError> {
     let run = directory.read()?;
     let schedule: Schedule = files::read_json(&directory.path().join("plan.json"))?;
-    let cache = cache_of(directory.runs());
+    let cache = Cache::of(directory.runs());
     let mut page = String::new();
     head(&mut page, &run, &schedule, directory);
     comparison(&mut page, directory);

@@ -5,7 +5,6 @@ use super::cache::{Cache, Entry, MANIFEST};
 use super::checkpoint;
 use super::environment;
 use super::error::RunError;
-use super::execute::cache_of;
 use super::files;
 use super::inputs;
 use super::interrupt::Interrupt;
@@ -59,7 +58,7 @@ pub fn verify(
 ) -> Result<Vec<Check>, RunError> {
     let schedule: Schedule = files::read_json(&run.path().join("plan.json"))?;
     let lock: LockFile = files::read_json(&run.path().join("lock.json"))?;
-    let cache = cache_of(run.runs());
+    let cache = Cache::of(run.runs());
     let mut checks = outside(&lock);
     for work in &schedule.works {
         interrupt.check()?;

@@ -1,6 +1,6 @@
 //! Bad input at the door: whatever it is given, the binary says what is wrong, exits with 1 and never panics.
 
-use reviv::run::execute::cache_of;
+use reviv::run::Cache;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output, Stdio};
@@ -161,7 +161,7 @@ fn what_lies_beside_an_experiment_is_no_more_trusted() {
 
 /// The artifact of an op: its folder in the cache.
 fn artifact(runs: &Path, file: &str) -> PathBuf {
-    let entries = cache_of(runs).entries().unwrap();
+    let entries = Cache::of(runs).entries().unwrap();
     let mut found = entries.into_iter().map(|leaf| leaf.path.join(file));
     found.find(|path| path.is_file()).unwrap()
 }

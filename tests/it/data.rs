@@ -7,8 +7,8 @@ use reviv::clip::store::ClipSet;
 use reviv::formats::npy::NpyArray;
 use reviv::formats::npz::Npz;
 use reviv::formats::png::{Picture, read};
+use reviv::run::Cache;
 use reviv::run::State;
-use reviv::run::execute::cache_of;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 
@@ -55,7 +55,7 @@ fn run(folder: &Path, experiment: &str) -> Result<PathBuf, String> {
     if outcome.state != State::Done {
         return Err(failures(&outcome).concat());
     }
-    let mut entries = cache_of(&folder.join("runs"))
+    let mut entries = Cache::of(&folder.join("runs"))
         .entries()
         .unwrap()
         .into_iter()

@@ -3,7 +3,7 @@
 
 use crate::kill_binary::BASE;
 use crate::run::artifacts;
-use reviv::run::execute::cache_of;
+use reviv::run::Cache;
 use reviv::run::record::RunDirectory;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -43,7 +43,7 @@ fn run(file: &Path, runs: &Path) -> Output {
 
 /// Runs on a disk that is too small for it. Gives what was finished.
 fn must_fail(file: &Path, runs: &Path, kib: u64) -> BTreeMap<String, Vec<u8>> {
-    let before = artifacts(&cache_of(runs));
+    let before = artifacts(&Cache::of(runs));
     let output = run(file, runs);
     let said = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(2), "{kib} KiB: {said}");
@@ -54,7 +54,7 @@ fn must_fail(file: &Path, runs: &Path, kib: u64) -> BTreeMap<String, Vec<u8>> {
     assert!(said.contains("help: free some space"), "{kib} KiB: {said}");
     assert!(!said.contains("panicked"), "{kib} KiB: {said}");
     assert_eq!(said.matches("error[").count(), 1, "told once: {said}");
-    let after = artifacts(&cache_of(runs));
+    let after = artifacts(&Cache::of(runs));
     for (name, bytes) in &before {
         assert!(after.get(name) == Some(bytes), "{kib} KiB: lost {name}");
     }
@@ -117,7 +117,7 @@ fn inside() {
     let said = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.success(), "{said}");
     assert!(said.contains("1 made, 2 found in the cache"), "{said}");
-    assert!(artifacts(&cache_of(&runs)) == artifacts(&cache_of(&untouched)));
+    assert!(artifacts(&Cache::of(&runs)) == artifacts(&Cache::of(&untouched)));
     assert_eq!(RunDirectory::all(&runs).unwrap().len(), 1);
 }
 

@@ -2,7 +2,7 @@
 
 use crate::run::{artifacts, cell, experiment, run};
 use reviv::experiment::Experiment;
-use reviv::run::execute::cache_of;
+use reviv::run::Cache;
 use reviv::run::record::RunDirectory;
 use reviv::run::{State, metrics};
 use serde_json::json;
@@ -80,8 +80,8 @@ fn a_sweep_killed_ten_times_at_random_moments_ends_with_the_bytes_of_an_untouche
     );
     run(&sweep(), untouched.path());
     assert_eq!(
-        artifacts(&cache_of(killed.path())),
-        artifacts(&cache_of(untouched.path())),
+        artifacts(&Cache::of(killed.path())),
+        artifacts(&Cache::of(untouched.path())),
         "seed {seed}"
     );
     assert_eq!(RunDirectory::all(killed.path()).unwrap().len(), 1);

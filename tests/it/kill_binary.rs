@@ -2,7 +2,7 @@
 
 use crate::kill::comes_to_rest;
 use crate::run::artifacts;
-use reviv::run::execute::cache_of;
+use reviv::run::Cache;
 use reviv::run::record::RunDirectory;
 use reviv::run::{State, metrics};
 use std::path::Path;
@@ -67,7 +67,7 @@ fn a_sweep_of_real_ops_killed_ten_times_ends_with_the_bytes_of_an_untouched_one(
     let start = Instant::now();
     complete(folder.path(), &untouched);
     let whole = start.elapsed();
-    let wanted = artifacts(&cache_of(&untouched));
+    let wanted = artifacts(&Cache::of(&untouched));
 
     // Other moments in every run of this test; said when it fails.
     let seed = u64::from(std::process::id());
@@ -81,7 +81,7 @@ fn a_sweep_of_real_ops_killed_ten_times_ends_with_the_bytes_of_an_untouched_one(
             // All of it was done before: once more from the beginning.
             finished += 1;
             assert!(finished < KILLS, "the work is too short to be killed");
-            assert_eq!(artifacts(&cache_of(&killed)), wanted, "seed {seed}");
+            assert_eq!(artifacts(&Cache::of(&killed)), wanted, "seed {seed}");
             std::fs::remove_dir_all(&killed).unwrap();
             continue;
         }
@@ -106,7 +106,7 @@ fn a_sweep_of_real_ops_killed_ten_times_ends_with_the_bytes_of_an_untouched_one(
         start.elapsed()
     );
     assert_eq!(
-        artifacts(&cache_of(&killed)),
+        artifacts(&Cache::of(&killed)),
         wanted,
         "seed {seed}, killed after {moments:?}"
     );

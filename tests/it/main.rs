@@ -4,6 +4,7 @@
 mod adt_evaluation;
 mod bad_input;
 mod bad_input_binary;
+mod circles;
 mod data;
 mod diagnostics;
 mod egom2p_examples;

@@ -14,8 +14,8 @@ use reviv::reconstruction::folder::{FOLDER, PAGE};
 use reviv::reconstruction::predictions::Predictions;
 use reviv::reconstruction::stitch::Stitcher;
 use reviv::reconstruction::windows::windows;
+use reviv::run::Cache;
 use reviv::run::State;
-use reviv::run::execute::cache_of;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 
@@ -107,7 +107,7 @@ fn run(folder: &Path) -> PathBuf {
 
 /// What a stage of this op (and modality) left, with its manifest's contents.
 fn made(runs: &Path, op: &str, modality: &str) -> (PathBuf, Value) {
-    let entries = cache_of(runs).entries().unwrap();
+    let entries = Cache::of(runs).entries().unwrap();
     let found = entries.into_iter().find_map(|leaf| {
         let text = std::fs::read_to_string(leaf.path.join("manifest.json")).ok()?;
         let manifest: Value = serde_json::from_str(&text).ok()?;

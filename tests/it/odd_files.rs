@@ -434,14 +434,14 @@ fn a_device_without_an_end_is_no_array() {
 #[test]
 fn pruning_waits_for_a_run_that_begins_and_keeps_what_it_found() {
     use crate::run::{artifacts, cell, experiment, run};
-    use reviv::run::execute::cache_of;
+    use reviv::run::Cache;
     use reviv::run::lock::{Lock, Mode};
     use std::time::Duration;
     let folder = tempfile::tempdir().unwrap();
     let runs = folder.path().join("runs");
     let asked = experiment(vec![cell("", 0, serde_json::json!({"steps": 25}), 1.0)]);
     let first = run(&asked, &runs);
-    let made = artifacts(&cache_of(&runs));
+    let made = artifacts(&Cache::of(&runs));
     // The run's directory is gone: its artifacts may go, but for a run that begins just now and finds them.
     std::fs::remove_dir_all(first.run.path()).unwrap();
     let begins = Lock::take(&runs.join(".lock-gc"), Mode::Shared).unwrap();
@@ -458,14 +458,14 @@ fn pruning_waits_for_a_run_that_begins_and_keeps_what_it_found() {
         done.recv_timeout(Duration::from_millis(300)).is_err(),
         "it did not wait"
     );
-    assert_eq!(artifacts(&cache_of(&runs)), made);
+    assert_eq!(artifacts(&Cache::of(&runs)), made);
     // The run writes what it refers to, and lets go.
     let second = run(&asked, &runs);
     assert_eq!(second.made, 0);
     drop(begins);
     let pruned = pruner.join().unwrap();
     assert!(pruned.paths.is_empty(), "{:?}", pruned.paths);
-    assert_eq!(artifacts(&cache_of(&runs)), made);
+    assert_eq!(artifacts(&Cache::of(&runs)), made);
 }
 
 proptest! {

@@ -2,6 +2,7 @@
 
 use crate::language_ops::Folder;
 use reviv::experiment::catalog::{Catalog, EntryText};
+use reviv::experiment::clashes::clashes;
 use reviv::experiment::load::{Request, load};
 use reviv::experiment::registry::Registry;
 use reviv::experiment::{
@@ -70,14 +71,14 @@ impl Op for Ambiguous {
 #[test]
 fn a_setting_and_an_input_of_one_name_are_refused() {
     let catalog = Catalog::of(&[&Ambiguous, &Ambiguous], &[], Vec::new());
-    let clashes = catalog.clashes();
+    let found = clashes(&catalog);
     assert_eq!(
-        clashes[0],
+        found[0],
         "two ops named `ambiguous` are linked into this binary"
     );
-    assert!(clashes[1].contains("a setting `seed`"), "{clashes:?}");
-    assert!(clashes[2].contains("a setting `tokens`"), "{clashes:?}");
-    assert_eq!(Catalog::linked().clashes(), [""; 0]);
+    assert!(found[1].contains("a setting `seed`"), "{found:?}");
+    assert!(found[2].contains("a setting `tokens`"), "{found:?}");
+    assert_eq!(clashes(&Catalog::linked()), [""; 0]);
 }
 
 #[test]

@@ -4,7 +4,7 @@ use reviv::experiment::{
     Arity, ArtifactKind, Cell, DataInput, Description, Edge, Experiment, Graph, Inputs, Op,
     OpEntry, Port, Problem, Stage, StageContext, StageError,
 };
-use reviv::run::execute::{Job, Outcome, cache_of, execute};
+use reviv::run::execute::{Job, Outcome, execute};
 use reviv::run::record::RunDirectory;
 use reviv::run::verify::{Check, Redo, Verdict};
 use reviv::run::{
@@ -282,11 +282,11 @@ fn the_same_experiment_asked_for_twice_does_the_work_once() {
     let asked = experiment(vec![cell("", 0, json!({"steps": 25}), 1.0)]);
     let first = run(&asked, dir.path());
     assert_eq!((first.state, first.made), (State::Done, 2));
-    let before = artifacts(&cache_of(dir.path()));
+    let before = artifacts(&Cache::of(dir.path()));
     let second = run(&asked, dir.path());
     assert_eq!((second.state, second.made), (State::Done, 0));
     assert_eq!(first.run.path(), second.run.path());
-    assert_eq!(before, artifacts(&cache_of(dir.path())));
+    assert_eq!(before, artifacts(&Cache::of(dir.path())));
     let page = std::fs::read_to_string(second.run.report()).unwrap();
     assert!(
         page.contains("The sum is <strong>")
@@ -333,7 +333,7 @@ fn a_data_set_is_its_bytes_wherever_it_lies() {
     }
     let first = run(&asked("here"), &runs);
     assert_eq!((first.state, first.made), (State::Done, 2));
-    let manifest = cache_of(&runs);
+    let manifest = Cache::of(&runs);
     let prints: Vec<_> = manifest
         .entries()
         .unwrap()
@@ -424,7 +424,7 @@ fn stages_made_at_the_same_time_have_the_same_bytes() {
     for outcome in &outcomes {
         assert_eq!((outcome.state, outcome.made), (State::Done, 6));
     }
-    let [one, several] = dirs.map(|dir| artifacts(&cache_of(dir.path())));
+    let [one, several] = dirs.map(|dir| artifacts(&Cache::of(dir.path())));
     assert_eq!(one, several);
 }
 
@@ -452,8 +452,8 @@ fn an_interrupted_run_goes_on_from_its_checkpoint_and_ends_with_the_same_bytes()
     run(&asked, copy);
     run(&asked, copy);
     assert_eq!(
-        artifacts(&cache_of(dirs[0].path())),
-        artifacts(&cache_of(copy))
+        artifacts(&Cache::of(dirs[0].path())),
+        artifacts(&Cache::of(copy))
     );
 }
 
@@ -557,7 +557,7 @@ fn a_half_written_cache_entry_is_made_again() {
     let dir = tempfile::tempdir().unwrap();
     let asked = experiment(vec![cell("", 0, json!({"steps": 25}), 1.0)]);
     run(&asked, dir.path());
-    let cache = cache_of(dir.path());
+    let cache = Cache::of(dir.path());
     let before = artifacts(&cache);
     for leaf in cache
         .entries()

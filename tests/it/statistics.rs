@@ -1,8 +1,9 @@
 //! `op: statistics` as an experiment runs it.
 
 use crate::run_text::{failures, run_text};
+use reviv::run::Cache;
 use reviv::run::State;
-use reviv::run::execute::{Outcome, cache_of};
+use reviv::run::execute::Outcome;
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 
@@ -25,7 +26,7 @@ fn run(folder: &Path, text: &str) -> Result<Outcome, String> {
 }
 
 fn artifacts(folder: &Path) -> Vec<PathBuf> {
-    let mut found: Vec<PathBuf> = cache_of(&folder.join("runs"))
+    let mut found: Vec<PathBuf> = Cache::of(&folder.join("runs"))
         .entries()
         .unwrap()
         .into_iter()

@@ -2,8 +2,8 @@
 
 use crate::run_text::{failures, run_text};
 use reviv::mget::{MgetSpec, ModalitySpec, Positions, Size};
+use reviv::run::Cache;
 use reviv::run::State;
-use reviv::run::execute::cache_of;
 use reviv::training::{Shards, TokenSource};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
@@ -54,7 +54,7 @@ fn run(folder: &Path) -> Vec<(String, PathBuf, Value)> {
     let outcome = run_text(folder, EXPERIMENT).unwrap_or_else(|report| panic!("{report}"));
     assert_eq!(outcome.state, State::Done, "{:?}", failures(&outcome));
     let mut artifacts = Vec::new();
-    for leaf in cache_of(&folder.join("runs")).entries().unwrap() {
+    for leaf in Cache::of(&folder.join("runs")).entries().unwrap() {
         let Ok(text) = std::fs::read_to_string(leaf.path.join("manifest.json")) else {
             continue;
         };

@@ -9,7 +9,7 @@ use crate::datasets::split::SplitSettings;
 use crate::datasets::status::{Status, status};
 use crate::experiment::catalog::Catalog;
 use crate::experiment::data::{DataRoot, roots};
-use crate::experiment::load;
+use crate::experiment::files;
 use crate::experiment::registry::Registry;
 use crate::experiment::source::Sources;
 use serde::Serialize;
@@ -113,7 +113,7 @@ fn plans(roots: &BTreeMap<String, DataRoot>) -> Result<BTreeMap<String, Plan>, F
     let catalog = Catalog::linked();
     let registry = Registry::new(
         &catalog,
-        load::beside(Path::new("./x"), "registry").as_deref(),
+        files::beside(Path::new("./x"), "registry").as_deref(),
     );
     let mut plans = BTreeMap::new();
     for name in registry.names("source") {

@@ -3,8 +3,8 @@
 use super::{Resolver, To};
 use crate::experiment::compose::Composer;
 use crate::experiment::diagnostic::{Diagnostic, Span};
+use crate::experiment::files::canonical;
 use crate::experiment::graph::Graph;
-use crate::experiment::load::canonical;
 use crate::experiment::names;
 use crate::experiment::problem::Code;
 use crate::experiment::source::Origin;

@@ -7,9 +7,9 @@
 use super::ReadError;
 use super::dataset::Recordings;
 use super::egom2p;
-use super::open::Frames;
 use super::recording::{CutSettings, DepthFrames, MountedCamera, Recording};
 use super::track::{SECOND, Track};
+use super::video_frames::Frames;
 use crate::formats::npz::Npz;
 use crate::formats::read_error::Position;
 use crate::video::{DecoderChoice, Video, VideoSettings};

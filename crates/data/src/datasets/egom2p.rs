@@ -5,9 +5,9 @@
 //! `[60, 21, 3]` in the camera. Tokens: the same with npz (or npy) files of integers of any width and shape
 //! ([`read_tokens`]). Relative depth videos carry no metres and are left out; 512-pathway ones, which do, are read.
 
-use super::open::Frames;
 use super::recording::{CutSettings, GazeSample, JointFrame, MountedCamera, Recording};
 use super::track::{Joints, SECOND, Track};
+use super::video_frames::Frames;
 use super::{ClipSource, Outcome, ReadError};
 use crate::clip::{DEPTH, Depth};
 use crate::formats::npy::{self, NpyArray};

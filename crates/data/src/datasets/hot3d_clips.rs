@@ -14,7 +14,7 @@ use super::mano::{self, Mano};
 use super::recording::{CutSettings, MountedCamera, Recording};
 use super::track::{Joints, SECOND, Track};
 use super::umetrack::{ANGLES, HandProfile};
-use super::{ReadError, open::HandModel};
+use super::{ReadError, kind::HandModel};
 use crate::formats::read_error::Position;
 use crate::geometry::camera::{Camera, Fisheye624, Lens};
 use crate::geometry::mano::{Convention, FingerPose, ManoPose, SHAPE};

@@ -13,7 +13,7 @@
 //!   [`convert`] into [`shards`], which are a source again, [`verify`] (whether they are whole), [`survey`] (a look at what is
 //!   there), [`status`] (how much there is)
 //!
-//! A further data set is one file that fills a [`recording::Recording`], and one line in [`open::Dataset`].
+//! A further data set is one file that fills a [`recording::Recording`], and one line in [`kind::Dataset`].
 
 pub mod adt;
 pub mod arctic;
@@ -32,6 +32,7 @@ pub mod h2o;
 pub mod holoassist;
 pub mod hot3d;
 pub mod hot3d_clips;
+pub mod kind;
 pub mod mano;
 pub mod mps;
 pub mod neutral;
@@ -47,6 +48,7 @@ pub mod taco;
 pub mod track;
 pub mod umetrack;
 pub mod verify;
+mod video_frames;
 
 pub use crate::clip::source::{ClipSource, Clips, DropReason, Excluded, Outcome, clips};
 pub use crate::formats::ReadError;

@@ -16,9 +16,9 @@ use manifest::{GazeUnit, JointFrameEntry, Manifest};
 
 use super::ReadError;
 use super::dataset::{Recordings, find};
-use super::open::Frames;
 use super::recording::{CutSettings, GazeSample, JointFrame, MountedCamera, Recording};
 use super::track::SECOND;
+use super::video_frames::Frames;
 use crate::formats::is_plain_name;
 use crate::formats::read_error::Position;
 use crate::formats::text;

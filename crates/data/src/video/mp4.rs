@@ -13,8 +13,8 @@ mod samples;
 pub use edits::{Edit, Shown};
 pub use entry::SampleEntry;
 
+use boxes::Defaults;
 use boxes::{Boxes, be32, be64};
-use fragment::Defaults;
 
 use crate::formats::ReadError;
 use crate::formats::read_error::Position;

@@ -4,7 +4,51 @@
 //! being left to a library's idea of a box filter. Where the target is larger than the source, area interpolation becomes
 //! linear interpolation between the two source pixels that a target pixel touches.
 
-use crate::video::image::Image;
+use crate::video::image::{Image, SquareFit, squared};
+
+impl Image {
+    /// The picture with square pixels, from pixels `aspect` times as wide as high; no side gets shorter.
+    #[must_use]
+    pub fn with_square_pixels(self, aspect: f64) -> Self {
+        let (width, height) = squared(self.width, self.height, aspect);
+        self.resized(width, height)
+    }
+
+    /// The picture at another size, by area.
+    #[must_use]
+    pub fn resized(self, width: u32, height: u32) -> Self {
+        if (width, height) == (self.width, self.height) {
+            return self;
+        }
+        area(&self, width, height)
+    }
+
+    /// Short side to `side` by area interpolation (the long side rounded), then the centre square: the geometry of every clip.
+    #[must_use]
+    pub fn square(&self, side: u32) -> Self {
+        let fit = SquareFit::new(self.width, self.height, side);
+        if fit.resized == (self.width, self.height) {
+            return self.clone().crop(fit.left, fit.top, side, side);
+        }
+        window(self, fit.resized, (fit.left, fit.top), (side, side))
+    }
+
+    fn crop(self, left: u32, top: u32, width: u32, height: u32) -> Self {
+        if (left, top, width, height) == (0, 0, self.width, self.height) {
+            return self;
+        }
+        let mut data = Vec::with_capacity(width as usize * height as usize * 3);
+        for row in top..top + height {
+            let from = (row as usize * self.width as usize + left as usize) * 3;
+            data.extend_from_slice(&self.data[from..from + width as usize * 3]);
+        }
+        Image {
+            width,
+            height,
+            data,
+        }
+    }
+}
 
 /// The share of source pixel `index` in a target pixel.
 #[derive(Debug, Clone, Copy, PartialEq)]

@@ -10,8 +10,8 @@ mod walls;
 pub use walls::{door, hang};
 
 use super::object;
-use super::room::{Style, Wall};
 use super::scene::{Rect, Scene, Spot};
+use super::wall::{Style, Wall};
 use crate::random::StreamRng;
 use floor::{floor_lamp, plant, sofa, toys};
 use nalgebra::Point2;

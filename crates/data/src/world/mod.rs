@@ -28,6 +28,7 @@ pub mod steps;
 pub mod texture;
 pub mod track;
 pub mod vector;
+mod wall;
 pub mod wearer;
 
 pub use clips::WorldClips;

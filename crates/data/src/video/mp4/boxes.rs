@@ -1,6 +1,5 @@
 //! Boxes inside boxes: the movie header down to the track and its codec.
 
-use super::fragment::{Defaults, entry_index};
 use super::{DEEPEST, Edit, Track};
 use crate::formats::ReadError;
 use crate::formats::read_error::Position;
@@ -12,6 +11,23 @@ pub(super) struct Boxes<'a> {
     /// Offset in the file of the bytes at hand.
     pub(super) base: u64,
     pub(super) file_len: u64,
+}
+
+/// What fragments leave out.
+#[derive(Debug, Default, Clone)]
+pub(super) struct Defaults {
+    /// Index of the sample description.
+    pub(super) entry: u16,
+    pub(super) duration: u32,
+    pub(super) size: u32,
+    pub(super) flags: u32,
+    /// Decoding time after the last fragment.
+    pub(super) next_time: i64,
+}
+
+/// From a number that counts from 1.
+pub(super) fn entry_index(number: u32) -> u16 {
+    u16::try_from(number.saturating_sub(1)).unwrap_or(u16::MAX)
 }
 
 /// A box's payload and its offset within the bytes at hand.

@@ -1,25 +1,8 @@
 //! Movie fragments: samples that are described beside the media, a few seconds at a time.
 
-use super::boxes::{Boxes, be32, be64};
+use super::boxes::{Boxes, Defaults, be32, be64, entry_index};
 use super::{SMALLEST_SAMPLE, Sample, Track};
 use crate::formats::ReadError;
-
-/// What fragments leave out.
-#[derive(Debug, Default, Clone)]
-pub(super) struct Defaults {
-    /// Index of the sample description.
-    pub(super) entry: u16,
-    pub(super) duration: u32,
-    pub(super) size: u32,
-    pub(super) flags: u32,
-    /// Decoding time after the last fragment.
-    pub(super) next_time: i64,
-}
-
-/// From a number that counts from 1.
-pub(super) fn entry_index(number: u32) -> u16 {
-    u16::try_from(number.saturating_sub(1)).unwrap_or(u16::MAX)
-}
 
 impl Boxes<'_> {
     pub(super) fn fragment(

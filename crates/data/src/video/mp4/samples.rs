@@ -1,7 +1,7 @@
 //! The sample tables of a track: where each picture's bytes are, and when it is shown.
 
+use super::boxes::entry_index;
 use super::boxes::{Boxes, Inner, be32, be64};
-use super::fragment::entry_index;
 use super::{SMALLEST_SAMPLE, Sample, Track};
 use crate::formats::ReadError;
 

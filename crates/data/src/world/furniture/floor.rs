@@ -3,10 +3,10 @@
 use super::{obstacle, stock};
 use crate::random::StreamRng;
 use crate::world::primitive::Shape;
-use crate::world::room::{Style, Wall};
 use crate::world::scene::{Scene, hsv, patterned};
 use crate::world::texture::{Material, Pattern};
 use crate::world::vector::{V3, v3};
+use crate::world::wall::{Style, Wall};
 use rand::RngExt;
 
 pub(super) fn sofa(

@@ -2,10 +2,10 @@
 
 use crate::random::StreamRng;
 use crate::world::primitive::Shape;
-use crate::world::room::{Style, Wall};
 use crate::world::scene::{Scene, hsv, patterned};
 use crate::world::texture::{Material, Pattern};
 use crate::world::vector::{V3, v3};
+use crate::world::wall::{Style, Wall};
 use nalgebra::Point3;
 use rand::RngExt;
 
