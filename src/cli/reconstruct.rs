@@ -3,6 +3,7 @@
 use super::request::open;
 use super::run::{RunsDir, interruptible, progress, tell};
 use super::terminal::{Failure, Terminal};
+use crate::engine::DeviceChoice;
 use crate::experiment::catalog::Catalog;
 use crate::experiment::load::Request;
 use crate::reconstruction::folder::{FOLDER, Manifest, PAGE};
@@ -56,6 +57,9 @@ pub struct Reconstruct {
     /// Who decodes the video
     #[arg(long, value_enum, value_name = "DECODER")]
     decoder: Option<DecoderChoice>,
+    /// Where the models run: auto, cpu, cuda, vulkan, metal or wgpu, a GPU also with its number: `cuda:1`
+    #[arg(long, value_name = "DEVICE")]
+    device: Option<DeviceChoice>,
     /// The seed of the decoding
     #[arg(long, value_name = "N")]
     seed: Option<u64>,
@@ -155,6 +159,9 @@ impl Reconstruct {
         }
         if let Some(decoder) = self.decoder {
             set.push(change("reading.decoder", decoder.name()));
+        }
+        if let Some(device) = self.device {
+            set.push(change("device", &device.to_string()));
         }
         set.extend(self.set.iter().cloned());
         Ok(Request {

@@ -112,6 +112,11 @@ pub fn form(catalog: &Catalog, schema: &Value) -> String {
                 .filter(|form| form != "null")
                 .collect();
             forms.dedup();
+            if let (Some(kinds), Some(last)) = (schema.get("x-numbered"), forms.last_mut())
+                && let Some(kind) = kinds.get(0).and_then(Value::as_str)
+            {
+                *last = format!("{kind}:1");
+            }
             return forms.join(" | ");
         }
     }

@@ -73,7 +73,7 @@ impl Editor<'_> {
                 let mut out = Map::new();
                 for (key, value) in map {
                     // A patch of a stage need not repeat what the file below has.
-                    if key == "required" || key == "x-path" {
+                    if key == "required" || key == "x-path" || key == "x-numbered" {
                         continue;
                     }
                     out.insert(key.clone(), self.loosen(value));

@@ -111,6 +111,9 @@ impl<'c> Validator<'c, '_> {
         {
             return self.value(only, node, path);
         }
+        if choice::numbered(schema, node) {
+            return Some(node.to_json());
+        }
         for word in ["anyOf", "oneOf"] {
             if let Some(choices) = schema.get(word).and_then(Value::as_array) {
                 let choices: Vec<&'c Value> =

@@ -17,6 +17,7 @@ use crate::nn::{CrossAttention, LayerNorm, Linear, SelfAttention, SwiGlu};
 #[derive(Debug, Clone)]
 pub struct Mget {
     spec: MgetSpec,
+    compute: Compute,
     mask_token: Parameter,
     pub(super) encoder_embeddings: Embeddings,
     decoder_embeddings: Heads,
@@ -86,6 +87,7 @@ impl Mget {
                 .collect(),
             decoder_norm: norm(size, init, "decoder_norm"),
             spec: spec.clone(),
+            compute: init.compute().clone(),
         })
     }
 
@@ -95,6 +97,12 @@ impl Mget {
     /// When the spec cannot be built.
     pub fn empty(spec: &MgetSpec, compute: &Compute) -> Result<Self, SpecError> {
         Self::new(spec, &Initialise::empty(compute))
+    }
+
+    /// Where the model computes.
+    #[must_use]
+    pub fn compute(&self) -> &Compute {
+        &self.compute
     }
 
     /// What the model is made of.

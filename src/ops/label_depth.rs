@@ -5,11 +5,12 @@
 
 use super::clip_signals::{SPLITS, damaged, described_format, format};
 use super::clips::shape_of;
+use super::device::compute;
 use crate::clip::depth_video::{DepthCoding, DepthKind, DepthRange};
 use crate::datasets::ClipSource;
 use crate::datasets::convert::{ConvertSettings, Share, convert};
 use crate::datasets::shards::{ShardClips, TarSink};
-use crate::engine::{Compute, DeviceChoice, Precision};
+use crate::engine::{DeviceChoice, Precision};
 use crate::experiment::{
     Arity, ArtifactKind, Code, Description, FileInput, FilePath, Inputs, Op, OpEntry, Port,
     Problem, SignalFacts, StageContext, StageError, StagePlan,
@@ -198,8 +199,7 @@ impl Op for LabelDepth {
             message: error.to_string(),
             help: String::new(),
         };
-        let compute =
-            Compute::new(settings.device, 0, Precision::F32).map_err(|error| refused(&error))?;
+        let compute = compute(settings.device, Precision::F32, context)?;
         let labeller = DepthLabeller::open(folder, &compute).map_err(|error| refused(&error))?;
         let kind = labeller.kind();
         let format = ClipFormat {

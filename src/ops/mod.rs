@@ -2,6 +2,7 @@
 
 mod clip_signals;
 pub mod clips;
+mod device;
 mod evaluate;
 mod import;
 mod kinds;

@@ -3,10 +3,11 @@
 //! Writes a folder of [`crate::reconstruction::predictions`]: decoded signals with a confidence per sample, and beside it the
 //! tokenizer floor: the clips' own signals after a round trip through the model's tokenizers.
 
+use super::device::compute;
 use crate::clip::Clip;
 use crate::clip::store::ClipSet;
 use crate::decoding::DecodingSettings;
-use crate::engine::Compute;
+use crate::engine::{DeviceChoice, Precision};
 use crate::evaluation::runtime::runtime;
 use crate::experiment::{
     Arity, ArtifactKind, Code, Description, Entry, InputArtifact, Inputs, Op, OpEntry, Port,
@@ -45,6 +46,8 @@ pub struct PredictSettings {
     pub limit: Option<usize>,
     /// Also write the tokenizer floor, which `evaluate` shows beside every metric.
     pub reconstruction_bound: bool,
+    /// Where the model runs.
+    pub device: DeviceChoice,
 }
 
 impl Default for PredictSettings {
@@ -59,6 +62,7 @@ impl Default for PredictSettings {
             split: "test".to_owned(),
             limit: None,
             reconstruction_bound: true,
+            device: DeviceChoice::CPU,
         }
     }
 }
@@ -221,8 +225,9 @@ impl Op for Predict {
         context: &mut dyn StageContext,
     ) -> Result<Value, StageError> {
         let _memory = crate::engine::memory::Stage;
+        let compute = compute(settings.device, Precision::F32, context)?;
         let model = artifact(context, "model")?;
-        let model = Model::open(&model.path, &Compute::cpu()).map_err(refused)?;
+        let model = Model::open(&model.path, &compute).map_err(refused)?;
         let root = artifact(context, "clips")?.path.join(&settings.split);
         let clips = ClipSet::open(&root).map_err(StageError::other)?;
         let total = clips.len().min(settings.limit.unwrap_or(usize::MAX));
@@ -296,7 +301,7 @@ impl Op for Predict {
         if let Some(floor) = floor {
             floor.finish().map_err(StageError::other)?;
         }
-        times.record(context, done)?;
+        times.record(context, done, &compute.name())?;
         Ok(json!({
             "split": settings.split,
             "clips": total,
@@ -321,7 +326,12 @@ impl Times {
     }
 
     /// Into the record of the run: what the clock says is no part of an artifact.
-    fn record(&self, context: &mut dyn StageContext, clips: usize) -> Result<(), StageError> {
+    fn record(
+        &self,
+        context: &mut dyn StageContext,
+        clips: usize,
+        device: &str,
+    ) -> Result<(), StageError> {
         let mut text = String::from(
             "| seconds per clip | median | mean | p90 | batches |\n|---|---|---|---|---|\n",
         );
@@ -340,7 +350,7 @@ impl Times {
                 )?;
             }
         }
-        let _ = writeln!(text, "\nBatches of {BATCH} clips on the CPU.");
+        let _ = writeln!(text, "\nBatches of {BATCH} clips on {device}.");
         context.record_text(clips as u64, "time", &text)
     }
 }

@@ -7,6 +7,7 @@ mod run;
 
 use super::predict::{artifact, takes_pixels};
 use crate::decoding::DecodingSettings;
+use crate::engine::DeviceChoice;
 use crate::experiment::{
     Arity, ArtifactKind, Code, Description, Entry, FileInput, FilePath, Inputs, Op, OpEntry, Port,
     Problem, StageContext, StageError, StagePlan,
@@ -59,6 +60,8 @@ pub struct ReconstructSettings {
     pub anchor: Option<FilePath>,
     /// The folder of a metric depth network (`reviv import --depth metric`) that makes the anchor from the video itself.
     pub anchor_model: Option<FilePath>,
+    /// Where the models run.
+    pub device: DeviceChoice,
 }
 
 impl Default for ReconstructSettings {
@@ -82,6 +85,7 @@ impl Default for ReconstructSettings {
             floor: FloorFit::default(),
             anchor: None,
             anchor_model: None,
+            device: DeviceChoice::CPU,
         }
     }
 }

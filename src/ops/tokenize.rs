@@ -6,9 +6,10 @@
 //! that is complete survives an interruption.
 
 use super::clip_signals::{SPLITS, damaged, format, modality, open_split};
+use super::device::compute;
 use crate::clip::shard::{ShardError, ShardWriter, TOKENS_PER_SHARD};
 use crate::clip::store::{ClipSet, tokens_to_bytes};
-use crate::engine::Compute;
+use crate::engine::{DeviceChoice, Precision};
 use crate::experiment::{
     Arity, ArtifactKind, Code, Description, Inputs, Op, OpEntry, Port, Problem, StageContext,
     StageError, StagePlan, TokenFacts, TokenPlan,
@@ -50,6 +51,8 @@ pub struct TokenizeSettings {
     pub modalities: Vec<String>,
     /// Raw video beside the tokens.
     pub pixels: RawVideo,
+    /// Where the tokenizers run.
+    pub device: DeviceChoice,
 }
 
 impl TokenizeSettings {
@@ -218,10 +221,11 @@ impl Op for Tokenize {
             .cloned()
             .ok_or_else(|| damaged("no clips arrived"))?;
         let format = format(&clips)?;
+        let compute = compute(settings.device, Precision::F32, context)?;
         let mut writers = Vec::new();
         let mut tokens = BTreeMap::new();
         for artifact in context.inputs("tokenizers").to_vec() {
-            let tokenizer = tokenizer::open(&artifact.path, &Compute::cpu())
+            let tokenizer = tokenizer::open(&artifact.path, &compute)
                 .map_err(|error| damaged(&error.to_string()))?;
             let name = tokenizer.modality().to_owned();
             if !settings.takes(&name) {

@@ -79,7 +79,7 @@ impl Default for TrainMgetSettings {
             positions: Positions::Released,
             weights: Vec::new(),
             train_share: 1.0,
-            device: DeviceChoice::Cpu,
+            device: DeviceChoice::CPU,
             precision: Precision::F32,
             training: TrainingSettings::default(),
         }

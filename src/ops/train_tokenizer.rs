@@ -11,7 +11,7 @@ mod run;
 use super::clip_signals::{described_format, modality, unknown_modality};
 use super::modality_entry::{DEFAULTS, read_defaults};
 use super::tokenizer_entry::TokenizerEntry;
-use crate::engine::{Compute, DeviceChoice, Initialise, Parameters, Precision};
+use crate::engine::{Compute, DeviceChoice, Initialise, Parameters};
 use crate::experiment::{
     Arity, ArtifactKind, Code, Description, Entry, Inputs, Op, OpEntry, Port, Problem,
     StageContext, StageError, StagePlan, TokenFacts, TokenPlan,
@@ -87,7 +87,7 @@ impl Default for TrainTokenizerSettings {
             keep: training.keep,
             validation_clips: 1000,
             kmeans: true,
-            device: DeviceChoice::Cpu,
+            device: DeviceChoice::CPU,
         }
     }
 }
@@ -366,11 +366,6 @@ fn parameters(entry: &TokenizerEntry, shape: &Shape) -> Option<u64> {
         TokenizerEntry::Video(settings) => Network::new(&planned, settings).ok()?.count(),
     };
     Some(count as u64)
-}
-
-/// The device to train on.
-fn compute(settings: &TrainTokenizerSettings) -> Result<Compute, StageError> {
-    Compute::new(settings.device, 0, Precision::F32).map_err(StageError::other)
 }
 
 #[cfg(test)]

@@ -12,7 +12,6 @@ use super::stitch::follows_camera;
 use super::windows::{samples_of, windows};
 use crate::clip::{CAMERA, Clip, RGB};
 use crate::decoding::DecodingSettings;
-use crate::engine::Compute;
 use crate::flow::Flow;
 use crate::labelling::DepthLabeller;
 use crate::masking::PIXELS;
@@ -176,7 +175,7 @@ pub fn reconstruct_recording(
         None => None,
         Some(Anchor::Maps(path)) => Some(anchor::read(path, frames)?),
         Some(Anchor::Model(folder)) => {
-            let labeller = DepthLabeller::open(folder, &Compute::cpu())?;
+            let labeller = DepthLabeller::open(folder, model.mget().compute())?;
             let name = labeller.network().settings().name();
             let name = name.unwrap_or("of other sizes");
             assumptions.push(Fact {

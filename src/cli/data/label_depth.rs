@@ -51,16 +51,12 @@ pub(super) struct LabelDepth {
     /// Frames per second of a folder of pictures
     #[arg(long, default_value_t = 30.0, value_name = "HZ")]
     folder_fps: f64,
-    /// cpu, cuda or vulkan
-    #[arg(long, default_value = "cpu", value_parser = device, value_name = "DEVICE")]
+    /// Where the network runs: auto, cpu, cuda, vulkan, metal or wgpu, a GPU also with its number: `cuda:1`
+    #[arg(long, default_value = "cpu", value_name = "DEVICE")]
     device: DeviceChoice,
     /// Write the result as JSON to stdout
     #[arg(long)]
     json: bool,
-}
-
-fn device(text: &str) -> Result<DeviceChoice, String> {
-    serde_json::from_value(json!(text)).map_err(|_| "not one of cpu, cuda, vulkan".to_owned())
 }
 
 /// What may end the work.
@@ -98,7 +94,7 @@ impl LabelDepth {
         if self.max_side == 0 {
             return Err(Failure::input("`--max-side` is 0", ""));
         }
-        let compute = Compute::new(self.device, 0, Precision::F32)
+        let compute = Compute::new(self.device, Precision::F32)
             .map_err(|error| Failure::input(error.to_string(), ""))?;
         let settings = VideoSettings {
             folder_fps: self.folder_fps,

@@ -191,6 +191,17 @@ impl<'c> Validator<'c, '_> {
     }
 }
 
+/// Whether a value is one of several of a kind, `cuda:1`, where the schema says that kinds are numbered.
+pub(super) fn numbered(schema: &Value, node: &Node) -> bool {
+    let kinds = schema.get("x-numbered").and_then(Value::as_array);
+    let Some((kinds, (kind, number))) = kinds.zip(node.text().and_then(|t| t.split_once(':')))
+    else {
+        return false;
+    };
+    let digits = !number.is_empty() && number.bytes().all(|byte| byte.is_ascii_digit());
+    digits && number.parse::<usize>().is_ok() && kinds.iter().any(|known| known == kind)
+}
+
 /// The names of an enum without data.
 pub(super) fn constants(schema: &Value) -> Option<Vec<String>> {
     let name = |value: &Value| match value {

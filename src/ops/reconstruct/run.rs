@@ -1,8 +1,9 @@
 //! Running `op: reconstruct`: the recording, one call, and where the time went.
 
+use super::super::device::compute;
 use super::ReconstructSettings;
 use crate::clip::store::ClipSet;
-use crate::engine::Compute;
+use crate::engine::Precision;
 use crate::experiment::{Code, StageContext, StageError};
 use crate::flow::Flow;
 use crate::modality::ClipFormat;
@@ -71,7 +72,8 @@ pub(super) fn run(
     context: &mut dyn StageContext,
 ) -> Result<Value, StageError> {
     let mut times = Times::start();
-    let model = Model::open(model, &Compute::cpu()).map_err(refused)?;
+    let compute = compute(settings.device, Precision::F32, context)?;
+    let model = Model::open(model, &compute).map_err(refused)?;
     times.lap("open the model");
     let options = options(settings, context.seed());
     let recording = recording(settings, &options, context, model.format())?;

@@ -1,8 +1,8 @@
 //! Running `op: train_mget`: tokens in, one call, a model folder out.
 
+use super::super::device::compute;
 use super::super::evaluate::write_text;
 use super::{TrainMgetSettings, spec};
-use crate::engine::Compute;
 use crate::experiment::{Code, InputArtifact, StageContext, StageError, TokenFacts};
 use crate::masking::{Masking, PIXELS};
 use crate::mget::MgetSpec;
@@ -74,8 +74,7 @@ pub(super) fn run(
         .map(|source| settings.used(source.len() as u64) as usize)
         .collect();
     let held_out = open(first, "validation")?;
-    let compute =
-        Compute::new(settings.device, 0, settings.precision).map_err(StageError::other)?;
+    let compute = compute(settings.device, settings.precision, context)?;
     let watch = Stopwatch::start();
     let (input, target) = masking.nominal_tokens();
     let mut record = Record {

@@ -1,9 +1,11 @@
 //! Running `op: train_tokenizer`: settings in, one call, scores and pictures out.
 
 use super::super::clip_signals::{damaged, format, modality, open_split};
+use super::super::device::compute;
 use super::super::modality_entry::DEFAULTS;
-use super::{TrainTokenizerSettings, compute, picture, report, tokens};
+use super::{TrainTokenizerSettings, picture, report, tokens};
 use crate::clip::source::ClipSource;
+use crate::engine::Precision;
 use crate::experiment::{Code, StageContext, StageError};
 use crate::run::checkpoint;
 use crate::training::tokenizer_scores::Scores;
@@ -32,7 +34,7 @@ pub(super) fn run(
     let having = (0..train.len()).filter(|index| train.may_have(*index, name));
     let having = having.count();
     let resume = checkpoint::latest(context.checkpoints());
-    let compute = compute(settings)?;
+    let compute = compute(settings.device, Precision::F32, context)?;
     let fit = TokenizerFit {
         modality: name,
         format: &format,

@@ -1,15 +1,20 @@
 //! Which device computes, and in which precision; chosen at run time.
 
+use std::borrow::Cow;
+use std::fmt;
+use std::str::FromStr;
+
 use burn::tensor::Device;
-use schemars::JsonSchema;
+use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::{Deserialize, Serialize};
 
 use super::EngineError;
 
-/// Where tensors live.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
-#[serde(rename_all = "snake_case")]
-pub enum DeviceChoice {
+/// What kind of device computes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum DeviceKind {
+    /// The first GPU of those that this build knows and this machine has; this machine's processor where there is none.
+    Auto,
     /// This machine's processor.
     #[default]
     Cpu,
@@ -17,6 +22,163 @@ pub enum DeviceChoice {
     Cuda,
     /// Any GPU with a Vulkan driver (builds with feature `vulkan`).
     Vulkan,
+    /// A GPU of Apple (builds with feature `metal`).
+    Metal,
+    /// Any GPU, also one that a program plays on the processor, through WGSL (builds with feature `wgpu`).
+    Wgpu,
+}
+
+impl DeviceKind {
+    const ALL: [Self; 6] = [
+        Self::Auto,
+        Self::Cpu,
+        Self::Cuda,
+        Self::Vulkan,
+        Self::Metal,
+        Self::Wgpu,
+    ];
+
+    /// As settings write it.
+    #[must_use]
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Auto => "auto",
+            Self::Cpu => "cpu",
+            Self::Cuda => "cuda",
+            Self::Vulkan => "vulkan",
+            Self::Metal => "metal",
+            Self::Wgpu => "wgpu",
+        }
+    }
+
+    /// Whether there may be several, told apart by a number.
+    const fn counted(self) -> bool {
+        !matches!(self, Self::Auto | Self::Cpu)
+    }
+
+    /// Whether this build can use such a device.
+    const fn built(self) -> bool {
+        match self {
+            Self::Auto | Self::Cpu => true,
+            Self::Cuda => cfg!(feature = "cuda"),
+            Self::Vulkan => cfg!(feature = "vulkan"),
+            Self::Metal => cfg!(feature = "metal"),
+            Self::Wgpu => cfg!(feature = "wgpu"),
+        }
+    }
+
+    const fn hints(self) -> [&'static str; 2] {
+        match self {
+            Self::Auto | Self::Cpu => ["", ""],
+            Self::Cuda => [
+                "this program was built without NVIDIA GPUs; build with `--features cuda`, or use `cpu`",
+                "this machine has no such NVIDIA GPU, or no driver for it; `cpu` always works",
+            ],
+            Self::Vulkan => [
+                "this program was built without Vulkan; build with `--features vulkan`, or use `cpu`",
+                "this machine has no such GPU with a Vulkan driver; `cpu` always works",
+            ],
+            Self::Metal => [
+                "this program was built without Metal; build with `--features metal` on a Mac, or use `cpu`",
+                "this machine has no such GPU of Apple; `cpu` always works",
+            ],
+            Self::Wgpu => [
+                "this program was built without WGSL; build with `--features wgpu`, or use `cpu`",
+                "this machine has no such GPU, and no driver that plays one (Mesa's lavapipe does); `cpu` always works",
+            ],
+        }
+    }
+}
+
+/// Where tensors live: `cpu`, `auto`, or a kind of GPU with the number of one of several, `cuda:1`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub struct DeviceChoice {
+    pub kind: DeviceKind,
+    /// Counts the devices of the kind from 0; discrete GPUs come first.
+    pub index: usize,
+}
+
+impl DeviceChoice {
+    /// This machine's processor.
+    pub const CPU: Self = Self::first(DeviceKind::Cpu);
+
+    /// The first device of a kind.
+    #[must_use]
+    pub const fn first(kind: DeviceKind) -> Self {
+        Self { kind, index: 0 }
+    }
+}
+
+impl fmt::Display for DeviceChoice {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.kind.name())?;
+        if self.index > 0 {
+            write!(f, ":{}", self.index)?;
+        }
+        Ok(())
+    }
+}
+
+impl FromStr for DeviceChoice {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let (name, index) = match text.split_once(':') {
+            Some((name, index)) => (name, Some(index)),
+            None => (text, None),
+        };
+        let kind = DeviceKind::ALL.into_iter().find(|kind| kind.name() == name);
+        let found = kind.and_then(|kind| {
+            let index = match index {
+                None => 0,
+                // `+1` is a number to the parser, and not one here.
+                Some(digits) if kind.counted() && digits.bytes().all(|b| b.is_ascii_digit()) => {
+                    digits.parse().ok()?
+                }
+                Some(_) => return None,
+            };
+            Some(Self { kind, index })
+        });
+        found.ok_or_else(|| {
+            format!(
+                "`{text}` is no device; one of auto, cpu, cuda, vulkan, metal, wgpu, a GPU also with its number: cuda:1"
+            )
+        })
+    }
+}
+
+impl TryFrom<String> for DeviceChoice {
+    type Error = String;
+
+    fn try_from(text: String) -> Result<Self, String> {
+        text.parse()
+    }
+}
+
+impl From<DeviceChoice> for String {
+    fn from(choice: DeviceChoice) -> Self {
+        choice.to_string()
+    }
+}
+
+impl JsonSchema for DeviceChoice {
+    fn schema_name() -> Cow<'static, str> {
+        "DeviceChoice".into()
+    }
+
+    fn json_schema(_: &mut SchemaGenerator) -> Schema {
+        let names = DeviceKind::ALL.map(DeviceKind::name);
+        let counted = DeviceKind::ALL.into_iter().filter(|kind| kind.counted());
+        let counted: Vec<&str> = counted.map(DeviceKind::name).collect();
+        let pattern = format!("^({}):[0-9]+$", counted.join("|"));
+        json_schema!({
+            "description": "Where tensors live: `cpu`; a kind of GPU, `cuda`, `vulkan`, `metal` or `wgpu`, with the number of one of several, \
+                `cuda:1`; `auto`, the first GPU that the build knows and the machine has, or the processor.",
+            "anyOf": [{ "enum": names }, { "type": "string", "pattern": pattern }],
+            "x-numbered": counted,
+        })
+    }
 }
 
 /// In which numbers matrix products are computed: f32 for now, on every device. Norms, softmax, losses, codebooks and weights are
@@ -34,6 +196,7 @@ pub enum Precision {
 #[derive(Debug, Clone)]
 pub struct Compute {
     device: Device,
+    choice: DeviceChoice,
 }
 
 impl Compute {
@@ -42,34 +205,42 @@ impl Compute {
     pub fn cpu() -> Self {
         Self {
             device: Device::flex(),
+            choice: DeviceChoice::CPU,
         }
     }
 
-    /// The device `choice` (`index` counts the devices of one kind), computing in `precision`.
+    /// The device `choice`, computing in `precision`. [`Compute::name`] says what `auto` took.
     ///
     /// # Errors
     /// When this build or this machine has no such device, or no operation computes in `precision`.
-    pub fn new(
-        choice: DeviceChoice,
-        index: usize,
-        precision: Precision,
-    ) -> Result<Self, EngineError> {
-        let device = match choice {
-            DeviceChoice::Cpu => Device::flex(),
-            DeviceChoice::Cuda => cuda(index)?,
-            DeviceChoice::Vulkan => vulkan(index)?,
+    pub fn new(choice: DeviceChoice, precision: Precision) -> Result<Self, EngineError> {
+        let found = match choice.kind {
+            DeviceKind::Auto => first_gpu(),
+            DeviceKind::Cpu => Some(Self::cpu()),
+            _ => Some(Self::gpu(choice)?),
         };
+        let found = found.unwrap_or_else(Self::cpu);
         if precision == Precision::Bf16 {
             return Err(EngineError::Precision {
                 precision: "bf16",
-                device: match choice {
-                    DeviceChoice::Cpu => "cpu".to_owned(),
-                    DeviceChoice::Cuda => format!("cuda:{index}"),
-                    DeviceChoice::Vulkan => format!("vulkan:{index}"),
-                },
+                device: found.choice.to_string(),
             });
         }
-        Ok(Self { device })
+        Ok(found)
+    }
+
+    fn gpu(choice: DeviceChoice) -> Result<Self, EngineError> {
+        let [not_built, not_there] = choice.kind.hints();
+        let refused = |hint| EngineError::NoSuchDevice {
+            device: choice.to_string(),
+            hint,
+        };
+        if !choice.kind.built() {
+            return Err(refused(not_built));
+        }
+        let device = found(choice.kind).into_iter().nth(choice.index);
+        let device = device.ok_or_else(|| refused(not_there))?;
+        Ok(Self { device, choice })
     }
 
     /// The tensor library's handle.
@@ -77,46 +248,98 @@ impl Compute {
     pub fn device(&self) -> &Device {
         &self.device
     }
+
+    /// What computes, never [`DeviceKind::Auto`].
+    #[must_use]
+    pub fn choice(&self) -> DeviceChoice {
+        self.choice
+    }
+
+    /// What computes, for people: `cpu`, `cuda:1 (NVIDIA H100)`.
+    #[must_use]
+    pub fn name(&self) -> String {
+        match identity(&self.device) {
+            Some(part) if self.choice.kind.counted() => format!("{} ({part})", self.choice),
+            _ => self.choice.to_string(),
+        }
+    }
 }
 
-#[cfg(feature = "cuda")]
-fn cuda(index: usize) -> Result<Device, EngineError> {
+/// A GPU in hardware, the fastest way to it first. A program that plays one is never chosen for anybody.
+fn first_gpu() -> Option<Compute> {
+    use DeviceKind::{Cuda, Metal, Vulkan, Wgpu};
+    let kinds = [Cuda, Metal, Vulkan, Wgpu].into_iter();
+    kinds.filter(|kind| kind.built()).find_map(|kind| {
+        let choice = DeviceChoice::first(kind);
+        let device = found(kind).into_iter().find(is_hardware)?;
+        Some(Compute { device, choice })
+    })
+}
+
+#[cfg(feature = "kernels")]
+fn found(kind: DeviceKind) -> Vec<Device> {
     use burn::tensor::DeviceType;
-    let mut found = Device::enumerate(DeviceType::Cuda).into_iter();
-    found.nth(index).ok_or_else(|| EngineError::NoSuchDevice {
-        device: format!("cuda:{index}"),
-        hint: "this machine has no such NVIDIA GPU, or no driver for it; `device: cpu` always works",
-    })
-}
-
-#[cfg(not(feature = "cuda"))]
-fn cuda(index: usize) -> Result<Device, EngineError> {
-    Err(EngineError::NoSuchDevice {
-        device: format!("cuda:{index}"),
-        hint: "this program was built without NVIDIA GPUs; build with `--features cuda`",
-    })
-}
-
-/// Discrete GPUs come first. Programs that play a GPU on the processor do not count.
-#[cfg(feature = "vulkan")]
-fn vulkan(index: usize) -> Result<Device, EngineError> {
-    use burn::tensor::{DeviceKind, DeviceType};
-    let software = Device::vulkan(DeviceKind::Cpu);
-    let mut found = Device::enumerate(DeviceType::Vulkan)
+    let kind = match kind {
+        #[cfg(feature = "cuda")]
+        DeviceKind::Cuda => DeviceType::Cuda,
+        #[cfg(feature = "vulkan")]
+        DeviceKind::Vulkan => DeviceType::Vulkan,
+        #[cfg(feature = "metal")]
+        DeviceKind::Metal => DeviceType::Metal,
+        #[cfg(feature = "wgpu")]
+        DeviceKind::Wgpu => DeviceType::Wgpu,
+        _ => return Vec::new(),
+    };
+    let (mut found, played): (Vec<Device>, Vec<Device>) = Device::enumerate(kind.clone())
         .into_iter()
-        .filter(|device| *device != software);
-    found.nth(index).ok_or_else(|| EngineError::NoSuchDevice {
-        device: format!("vulkan:{index}"),
-        hint: "this machine has no such GPU with a Vulkan driver; `device: cpu` always works",
-    })
+        .partition(is_hardware);
+    // What plays a GPU is there for tests, under the one name that says so.
+    if cfg!(feature = "wgpu") && is_wgpu(&kind) {
+        found.extend(played);
+    }
+    found
 }
 
-#[cfg(not(feature = "vulkan"))]
-fn vulkan(index: usize) -> Result<Device, EngineError> {
-    Err(EngineError::NoSuchDevice {
-        device: format!("vulkan:{index}"),
-        hint: "this program was built without Vulkan; build with `--features vulkan`",
-    })
+#[cfg(feature = "wgpu")]
+fn is_wgpu(kind: &burn::tensor::DeviceType) -> bool {
+    *kind == burn::tensor::DeviceType::Wgpu
+}
+
+#[cfg(all(feature = "kernels", not(feature = "wgpu")))]
+fn is_wgpu(_: &burn::tensor::DeviceType) -> bool {
+    false
+}
+
+#[cfg(not(feature = "kernels"))]
+fn found(_: DeviceKind) -> Vec<Device> {
+    Vec::new()
+}
+
+/// Whether a GPU is one, and not a program.
+#[cfg(any(feature = "vulkan", feature = "metal", feature = "wgpu"))]
+fn is_hardware(device: &Device) -> bool {
+    use burn::backend::{DispatchDevice, wgpu::WgpuDeviceKind};
+    use burn_cubecl::CubeDevice;
+    match device.as_dispatch() {
+        DispatchDevice::Cube(CubeDevice::Wgpu(device)) => device.kind != WgpuDeviceKind::Cpu,
+        _ => true,
+    }
+}
+
+#[cfg(not(any(feature = "vulkan", feature = "metal", feature = "wgpu")))]
+fn is_hardware(_: &Device) -> bool {
+    true
+}
+
+/// What the driver calls the device.
+#[cfg(feature = "kernels")]
+fn identity(device: &Device) -> Option<String> {
+    device.identity().map(|identity| identity.name)
+}
+
+#[cfg(not(feature = "kernels"))]
+fn identity(_: &Device) -> Option<String> {
+    None
 }
 
 #[cfg(test)]
@@ -125,7 +348,7 @@ mod tests {
 
     #[test]
     fn bf16_is_refused_by_name_with_the_device() {
-        let error = Compute::new(DeviceChoice::Cpu, 0, Precision::Bf16).unwrap_err();
+        let error = Compute::new(DeviceChoice::CPU, Precision::Bf16).unwrap_err();
         let message = error.to_string();
         assert!(
             message.contains("`bf16`") && message.contains("`cpu`"),
@@ -133,25 +356,61 @@ mod tests {
         );
     }
 
-    #[cfg(not(feature = "cuda"))]
     #[test]
-    fn a_missing_device_says_how_to_get_it() {
-        let error = Compute::new(DeviceChoice::Cuda, 1, Precision::F32).unwrap_err();
-        assert!(error.to_string().contains("--features cuda"), "{error}");
+    fn a_device_is_a_name_and_may_have_a_number() {
+        for text in ["auto", "cpu", "cuda", "cuda:3", "wgpu:1", "metal", "vulkan"] {
+            let choice: DeviceChoice = text.parse().unwrap();
+            assert_eq!(choice.to_string(), text);
+        }
+        assert_eq!(
+            "cuda:0".parse::<DeviceChoice>().unwrap().to_string(),
+            "cuda"
+        );
+        for text in [
+            "",
+            "gpu",
+            "cpu:1",
+            "auto:0",
+            "cuda:",
+            "cuda:x",
+            "cuda:+1",
+            "cuda:1:2",
+            "Cuda",
+            "cuda:99999999999999999999",
+        ] {
+            let error = text.parse::<DeviceChoice>().unwrap_err();
+            assert!(error.contains("cuda:1"), "{text}: {error}");
+        }
     }
 
-    #[cfg(any(feature = "cuda", feature = "vulkan"))]
+    #[test]
+    fn a_kind_that_was_not_built_in_says_how_to_get_it() {
+        for kind in DeviceKind::ALL.into_iter().filter(|kind| !kind.built()) {
+            let error = Compute::new(DeviceChoice { kind, index: 1 }, Precision::F32).unwrap_err();
+            let message = error.to_string();
+            let feature = format!("--features {}", kind.name());
+            assert!(message.contains(&feature), "{message}");
+            assert!(
+                message.contains(&format!("`{}:1`", kind.name())),
+                "{message}"
+            );
+        }
+    }
+
     #[test]
     fn a_gpu_that_the_machine_lacks_is_refused_before_anything_is_computed() {
-        let choices = [
-            #[cfg(feature = "cuda")]
-            DeviceChoice::Cuda,
-            #[cfg(feature = "vulkan")]
-            DeviceChoice::Vulkan,
-        ];
-        for choice in choices {
-            let error = Compute::new(choice, 99, Precision::F32).unwrap_err();
+        let built = |kind: &DeviceKind| kind.built() && kind.counted();
+        for kind in DeviceKind::ALL.into_iter().filter(built) {
+            let error = Compute::new(DeviceChoice { kind, index: 99 }, Precision::F32).unwrap_err();
             assert!(error.to_string().contains("no such"), "{error}");
         }
+    }
+
+    #[test]
+    fn auto_always_finds_something_and_says_what() {
+        let auto = DeviceChoice::first(DeviceKind::Auto);
+        let taken = Compute::new(auto, Precision::F32).unwrap();
+        assert_ne!(taken.choice().kind, DeviceKind::Auto);
+        assert!(taken.name().starts_with(taken.choice().kind.name()));
     }
 }

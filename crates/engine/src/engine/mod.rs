@@ -23,7 +23,7 @@ pub mod segments;
 pub mod weights;
 
 pub use burn::tensor::{Bool, Device, Int, Tensor};
-pub use compute::{Compute, DeviceChoice, Precision};
+pub use compute::{Compute, DeviceChoice, DeviceKind, Precision};
 pub use gradients::Gradients;
 pub use initialise::Initialise;
 pub use parameters::{Parameter, Parameters, parameters};
