@@ -324,11 +324,47 @@ impl VqVae {
             (Some(valid_NP), Loss::MaskedMse) => square_NP * valid_NP.clone(),
             _ => square_NP,
         };
-        let loss = self.total(square_NP, batch);
-        if self.settings.velocity_weight == 0.0 {
-            return loss;
+        let mut loss = self.total(square_NP, batch);
+        let (velocity, pose) = (self.settings.velocity_weight, self.settings.pose_weight);
+        if velocity > 0.0 {
+            loss = loss + self.velocity(error_NP.clone(), batch) * velocity;
         }
-        loss + self.velocity(error_NP, batch) * self.settings.velocity_weight
+        if pose > 0.0 {
+            loss = loss + self.pose(error_NP, batch) * pose;
+        }
+        loss
+    }
+
+    /// The penalty of the errors of joints relative to the mean error of all joints of the sample; joints that are not valid have
+    /// none.
+    fn pose(&self, error_NP: Tensor<2>, batch: &Batch) -> Tensor<1> {
+        let channels = self.patches.channels();
+        let joints = self.patches.values_per_sample() / channels;
+        let order = self.order(&error_NP);
+        let over_joints = |x_NP: Tensor<2>| {
+            let [samples, values] = [batch.samples, order.dims()[0]];
+            let x = x_NP.reshape([samples, values]).select(1, order.clone());
+            x.reshape([samples * values / joints / channels, joints, channels])
+        };
+        let error = over_joints(error_NP);
+        let [rows, ..] = error.dims();
+        let relative = match &batch.valid_NP {
+            Some(valid_NP) => {
+                let valid = over_joints(valid_NP.clone());
+                let error = error * valid.clone();
+                let count = valid.clone().sum_dim(1).clamp_min(1.0);
+                (error.clone() - error.sum_dim(1) / count) * valid
+            }
+            None => error.clone() - error.mean_dim(1),
+        };
+        self.total(relative.square().reshape([rows, joints * channels]), batch)
+    }
+
+    /// Where the values of a signal stand in its patches, on the device of `like`.
+    fn order(&self, like: &Tensor<2>) -> Tensor<1, Int> {
+        let order: Vec<i64> = self.patches.positions().map(|at| at as i64).collect();
+        let values = order.len();
+        Tensor::from_data(TensorData::new(order, [values]), &like.device())
     }
 
     /// The penalty of the errors of steps from each sample to the next; both have to be valid.
@@ -338,9 +374,7 @@ impl VqVae {
             tokens * width / batch.samples,
             self.patches.values_per_sample(),
         );
-        let order: Vec<i64> = self.patches.positions().map(|init| init as i64).collect();
-        let order =
-            Tensor::<1, Int>::from_data(TensorData::new(order, [values]), &error_NP.device());
+        let order = self.order(&error_NP);
         let over_time = |x_NP: Tensor<2>| {
             x_NP.reshape([batch.samples, values])
                 .select(1, order.clone())
@@ -489,6 +523,54 @@ mod tests {
             let message = settings.patches(&shape).unwrap_err().to_string();
             assert!(message.contains(number), "{message}");
         }
+    }
+
+    #[test]
+    fn the_pose_weight_sees_joints_against_each_other_and_not_where_all_of_them_are() {
+        let shape = Shape::Kinematic {
+            samples: 4,
+            joints: 6,
+        };
+        let compute = Compute::cpu();
+        let with = |pose_weight: f64| {
+            let settings = VqSettings {
+                pose_weight,
+                ..joint_settings()
+            };
+            VqVae::new(&Initialise::new(&compute, 3), &settings, &shape).unwrap()
+        };
+        let (without, weighted) = (with(0.0), with(2.0));
+        // Half of the samples are invalid, and far off where they are.
+        let valid: Vec<bool> = (0..24).map(|i| i >= 12).collect();
+        let truth = [0.0_f32; 72];
+        let error = |shift: &dyn Fn(usize) -> f32| -> f64 {
+            let values: Vec<f32> = (0..72)
+                .map(|i| if i < 36 { 9.0 } else { shift(i / 3 % 6) })
+                .collect();
+            let batch = without.batch([(&truth[..], Some(&valid[..]))]);
+            let mut found = Vec::new();
+            without.patches().cut(&values, &mut found);
+            let shape = batch.values_NP.dims();
+            let found = Tensor::from_data(TensorData::new(found, shape), compute.device());
+            let loss = |model: &VqVae| f64::from(to_host(model.loss(found.clone(), &batch))[0]);
+            loss(&weighted) - loss(&without)
+        };
+        assert!(error(&|_| 1.5).abs() < 1e-5);
+        // One joint of six is off by one: five by a sixth, one by five sixths, on three axes.
+        let relative = 3.0 * (5.0 / 36.0 + 25.0 / 36.0) / 6.0;
+        let found = error(&|joint| f32::from(u8::from(joint == 2)));
+        assert!((found - 2.0 * relative).abs() < 1e-5, "{found}");
+
+        let temporal = Shape::Temporal {
+            samples: 4,
+            channels: 9,
+        };
+        let refused = VqSettings {
+            pose_weight: 1.0,
+            ..VqSettings::temporal_small()
+        };
+        let message = refused.patches(&temporal).unwrap_err().to_string();
+        assert!(message.contains("pose_weight is for joints"), "{message}");
     }
 
     fn joint_settings() -> VqSettings {

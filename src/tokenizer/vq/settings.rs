@@ -44,6 +44,10 @@ pub struct VqSettings {
     /// this smooths them. 0: none, as in the paper.
     #[serde(alias = "velocity")]
     pub velocity_weight: f64,
+    /// For joints: weight of the errors of joints relative to their centre, beside the errors of their places. Places vary most, and
+    /// a small codebook spends itself on them; this makes it keep the pose. 0: none, as in the paper.
+    #[serde(skip_serializing_if = "is_zero")]
+    pub pose_weight: f64,
     /// Decay of the running means of codes and counts.
     pub ema_decay: f64,
     /// Codes with a smaller running count are replaced by latents of the batch.
@@ -53,6 +57,12 @@ pub struct VqSettings {
     pub commitment_weight: f64,
     /// How the position table of a grid of joints is enumerated.
     pub positions: GridOrder,
+}
+
+/// Left out where it is 0, so that what was made before there was such a weight keeps its identity.
+#[allow(clippy::trivially_copy_pass_by_ref)]
+fn is_zero(weight: &f64) -> bool {
+    *weight == 0.0
 }
 
 impl Default for VqSettings {
@@ -68,6 +78,7 @@ impl Default for VqSettings {
             mlp_ratio: 4,
             loss: Loss::MaskedMse,
             velocity_weight: 0.0,
+            pose_weight: 0.0,
             ema_decay: 0.99,
             dead_below: 2.0,
             commitment_weight: 1.0,
@@ -149,11 +160,15 @@ impl VqSettings {
             || self.dead_below < 0.0
             || self.commitment_weight < 0.0
             || self.velocity_weight < 0.0
+            || self.pose_weight < 0.0
         {
             return wrong(
-                "ema_decay lies in [0, 1), dead_below, commitment_weight and velocity_weight are not negative"
+                "ema_decay lies in [0, 1), dead_below, commitment_weight, velocity_weight and pose_weight are not negative"
                     .to_owned(),
             );
+        }
+        if self.pose_weight > 0.0 && !matches!(shape, Shape::Kinematic { .. }) {
+            return wrong("pose_weight is for joints; a signal over time has no pose".to_owned());
         }
         Patches::new(shape, &self.compression)
     }
