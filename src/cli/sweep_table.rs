@@ -1,8 +1,10 @@
-//! The `compare:` block of a sweep: `report/table.{md,tex,csv}` and `report/table_intervals.svg` of its run, which the run's page shows.
+//! The `compare:` block of a sweep: `report/table.{md,tex,csv}`, `report/table_intervals.svg` and, in words,
+//! `report/conclusion.md` of its run, which the run's page shows.
 
 use super::compare::{entrants_of, published};
 use super::terminal::Failure;
 use crate::evaluation::compare::{CompareSettings, IntervalSettings, compare};
+use crate::evaluation::conclusion::conclusion;
 use crate::evaluation::intervals;
 use crate::evaluation::render::{Format, render};
 use crate::evaluation::statistics::Over;
@@ -46,9 +48,17 @@ pub fn write(
         files::write(&folder.join(name), render(&table, format).as_bytes())
             .map_err(Failure::machine)?;
     }
+    let said = conclusion(&table, asked.baseline.as_deref(), asked.interval.level);
+    let text = said.join(" ");
+    files::write(&folder.join(report::CONCLUSION), text.as_bytes()).map_err(Failure::machine)?;
     if let Some(plot) = intervals::svg(&table) {
         files::write(&folder.join(report::PLOT), plot.as_bytes()).map_err(Failure::machine)?;
     }
     report::write(run).map_err(Failure::machine)?;
-    Ok(render(&table, Format::Terminal))
+    let rendered = render(&table, Format::Terminal);
+    Ok(if text.is_empty() {
+        rendered
+    } else {
+        format!("{rendered}\n{}\n", said.join("\n"))
+    })
 }

@@ -4,7 +4,8 @@
 //! [`motion`], [`tmr`] (the encoder of motions), [`tokens`], [`runtime`]; then [`metric`] (what a modality brings: [`sets`] are the
 //! built-in ones), [`evaluate`] (every clip of a [`suite`] into [`scores`]), [`statistics`], and [`compare`]
 //! (many scores into one [`table`], a `side` per row, which [`render`] prints and
-//! [`intervals`] draws; `verdict` says what beats the trivial baselines). [`tum`] compares trajectory files.
+//! [`intervals`] draws; `verdict` says what beats the trivial baselines, [`mod@conclusion`] what a
+//! comparison shows). [`tum`] compares trajectory files.
 //!
 //! Arithmetic is f64; inputs are metres and seconds; angles are reported in degrees.
 
@@ -15,6 +16,7 @@
 
 pub mod columns;
 pub mod compare;
+pub mod conclusion;
 pub mod depth;
 pub mod evaluate;
 pub mod folders;

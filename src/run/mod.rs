@@ -22,7 +22,7 @@ pub mod inputs;
 pub mod interrupt;
 mod job;
 pub mod lock;
-mod markdown;
+pub mod markdown;
 pub mod metrics;
 pub mod progress;
 pub mod provenance;

@@ -1,5 +1,5 @@
-//! The page of a run, `report/index.html`: what came out, stages and times, curves and numbers, what the other ops have to
-//! show, settings, origin. One file, no network, no script.
+//! The page of a run, `report/index.html`: what came out, the curves of losses, and behind folds stages and times, other curves and
+//! numbers, what the other ops have to show, settings, origin. One file, no network, no script.
 //!
 //! An op joins in by leaving `report/*.md`, `report/*.svg` or `report/*.png` in its artifact (or
 //! `reconstruction/view.html`, which is linked): pieces are shown in the order of their names under the stage's heading.
@@ -13,7 +13,7 @@ use super::markdown::{escape, html};
 use super::metrics;
 use super::progress::duration;
 use super::provenance::LockFile;
-use super::record::{Run, RunDirectory};
+use super::record::{Run, RunDirectory, State};
 use super::schedule::{Schedule, Task};
 use super::stage::StageRecord;
 use base64::Engine as _;
@@ -22,6 +22,8 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
 use std::path::Path;
 
+/// What the comparison of a sweep shows, in words, beside the page.
+pub const CONCLUSION: &str = "conclusion.md";
 /// The comparison of a sweep's arms, beside the page.
 pub const TABLE: &str = "table.md";
 /// The same as a plot, beside it.
@@ -42,15 +44,30 @@ pub fn write(directory: &RunDirectory) -> Result<(), RunError> {
     let (results, parts) = results(&schedule);
     for work in results {
         sections(&mut page, work, &schedule, &cache)?;
+    }
+    for work in &schedule.works {
         linked(&mut page, work, &schedule, directory, &cache)?;
     }
+    let measured = Measured::read(&schedule, directory, &cache)?;
+    measured.losses(&mut page);
+    // Who looks at a run that has not ended wants to see where it stands.
+    let open = if run.state == State::Done {
+        ""
+    } else {
+        " open"
+    };
+    let _ = writeln!(page, "<details{open}><summary>Stages and times</summary>");
     stages(&mut page, &schedule, directory);
-    measurements(&mut page, &schedule, directory, &cache)?;
+    page.push_str("</details>\n");
+    measured.others(&mut page);
+    let mut rest = String::new();
     for work in parts {
-        sections(&mut page, work, &schedule, &cache)?;
-        linked(&mut page, work, &schedule, directory, &cache)?;
+        sections(&mut rest, work, &schedule, &cache)?;
     }
-    origin(&mut page, directory);
+    fold(&mut page, "What the stages before have to show", &rest);
+    let mut rest = String::new();
+    origin(&mut rest, &run, directory);
+    fold(&mut page, "Settings and origin", &rest);
     page += "</main></body></html>\n";
     let path = directory.report();
     files::create_directory(path.parent().unwrap_or(directory.path()))?;
@@ -59,10 +76,11 @@ pub fn write(directory: &RunDirectory) -> Result<(), RunError> {
 
 const STYLE: &str = "body{font:15px/1.5 system-ui,sans-serif;margin:0;color:#1a1a1a;background:#fff}\
 main{max-width:64rem;margin:0 auto;padding:1.5rem}h1{margin:.2rem 0}h2{margin-top:2rem;border-bottom:1px solid #ccc}\
-table{border-collapse:collapse;margin:.8rem 0;display:block;overflow-x:auto}th,td{padding:.2rem .7rem;text-align:left;\
-border-bottom:1px solid #e3e3e3;white-space:nowrap;font-variant-numeric:tabular-nums}.n{text-align:right}\
+table{border-collapse:collapse;margin:.8rem 0}th,td{padding:.2rem .7rem;text-align:left;vertical-align:top;\
+border-bottom:1px solid #e3e3e3;overflow-wrap:anywhere;font-variant-numeric:tabular-nums}.n{text-align:right}\
+details{border-top:1px solid #ccc;padding:.6rem 0}summary{font-weight:600}.said{font-size:1.15em}\
 code,pre{font:13px/1.45 ui-monospace,monospace}pre{background:#f5f5f5;padding:.8rem;overflow-x:auto}\
-.plots{display:flex;flex-wrap:wrap;gap:.5rem}img{max-width:100%}summary{cursor:pointer}\
+.plots{display:flex;flex-wrap:wrap;gap:.5rem}.plots img{max-width:min(100%,30rem)}img{max-width:100%}summary{cursor:pointer}\
 @media(prefers-color-scheme:dark){body{background:#161616;color:#e8e8e8}pre{background:#222}th,td{border-color:#333}\
 img{background:#fff}a{color:#8ab4f8}}";
 
@@ -76,9 +94,28 @@ fn head(page: &mut String, run: &Run, schedule: &Schedule, directory: &RunDirect
         run.state
     );
     page.push_str(&html(&schedule.about));
+    let _ = writeln!(
+        page,
+        "<p>{}: <code>{}</code>, {}</p>",
+        run.state,
+        escape(&directory.name()),
+        escape(&run.created)
+    );
+    for part in run.parts.values() {
+        if let Some(error) = &part.error {
+            let _ = writeln!(
+                page,
+                "<p><strong>{}</strong>: {}</p>",
+                escape(&error.code),
+                escape(&error.message)
+            );
+        }
+    }
+}
+
+/// Who made the run when.
+fn history(run: &Run) -> Vec<(&'static str, String)> {
     let mut rows = vec![
-        ("state", run.state.to_string()),
-        ("run", directory.name()),
         ("experiment", run.experiment.clone()),
         ("created", run.created.clone()),
     ];
@@ -93,15 +130,18 @@ fn head(page: &mut String, run: &Run, schedule: &Schedule, directory: &RunDirect
             "last work",
             format!("{label}: {} to {ended} on {}", part.started, part.host),
         ));
-        if let Some(error) = &part.error {
-            rows.push(("error", format!("{}: {}", error.code, error.message)));
-        }
     }
-    page.push_str("<table>\n");
-    for (name, value) in rows {
-        let _ = writeln!(page, "<tr><th>{name}</th><td>{}</td></tr>", escape(&value));
+    rows
+}
+
+/// Something that few look for.
+fn fold(page: &mut String, summary: &str, inside: &str) {
+    if !inside.is_empty() {
+        let _ = writeln!(
+            page,
+            "<details><summary>{summary}</summary>\n{inside}</details>"
+        );
     }
-    page.push_str("</table>\n");
 }
 
 /// What an experiment is for, and the rest: the stages that no other reads. A sweep's result is its comparison.
@@ -116,6 +156,12 @@ fn results(schedule: &Schedule) -> (Vec<&Task>, Vec<&Task>) {
 
 /// The table of a sweep's `compare:` block, if it was written: it needs every arm.
 fn comparison(page: &mut String, directory: &RunDirectory) {
+    let said = std::fs::read_to_string(directory.path().join("report").join(CONCLUSION));
+    if let Ok(said) = said
+        && !said.is_empty()
+    {
+        let _ = writeln!(page, "<div class=\"said\">{}</div>", html(&said));
+    }
     let path = directory.path().join("report").join(TABLE);
     let small = std::fs::metadata(&path).is_ok_and(|meta| meta.len() <= LARGEST_PIECE);
     if let (true, Ok(text)) = (small, std::fs::read_to_string(&path)) {
@@ -139,7 +185,7 @@ fn stage_directory(directory: &RunDirectory, work: &Task) -> std::path::PathBuf 
 }
 
 fn stages(page: &mut String, schedule: &Schedule, directory: &RunDirectory) {
-    page.push_str("<h2>Stages</h2>\n<table>\n<tr><th>stage</th><th>op</th><th>state</th><th class=\"n\">time</th><th>artifact</th></tr>\n");
+    page.push_str("<table>\n<tr><th>stage</th><th>op</th><th>state</th><th class=\"n\">time</th><th>artifact</th></tr>\n");
     for work in &schedule.works {
         let record = StageRecord::read(&stage_directory(directory, work));
         let state = record
@@ -171,88 +217,126 @@ fn stages(page: &mut String, schedule: &Schedule, directory: &RunDirectory) {
     page.push_str("</table>\n");
 }
 
-/// What was measured on the way: one plot per stage name and metric, with a line per cell; a table of what was measured once.
-fn measurements(
-    page: &mut String,
-    schedule: &Schedule,
-    directory: &RunDirectory,
-    cache: &Cache,
-) -> Result<(), RunError> {
-    let mut plots: BTreeMap<(usize, String), Vec<Curve>> = BTreeMap::new();
-    let mut order: Vec<&str> = Vec::new();
-    for work in &schedule.works {
-        let position = order
-            .iter()
-            .position(|name| *name == work.stage)
-            .unwrap_or_else(|| {
-                order.push(&work.stage);
-                order.len() - 1
+/// What was measured on the way: a plot per stage name and metric, with a line per cell.
+#[derive(Debug)]
+struct Measured<'a> {
+    /// Names of the stages.
+    stages: Vec<&'a str>,
+    /// By stage and metric, more than one step.
+    plots: Vec<((usize, String), Vec<Curve>)>,
+    /// By stage and metric, measured once.
+    once: Vec<((usize, String), Vec<Curve>)>,
+}
+
+/// Whether a metric is what training makes small: `loss` of a step, `validation/loss` of held-out clips.
+fn is_loss(metric: &str) -> bool {
+    metric == "loss" || metric.ends_with("/loss")
+}
+
+impl<'a> Measured<'a> {
+    fn read(
+        schedule: &'a Schedule,
+        directory: &RunDirectory,
+        cache: &Cache,
+    ) -> Result<Self, RunError> {
+        let mut found: BTreeMap<(usize, String), Vec<Curve>> = BTreeMap::new();
+        let mut stages: Vec<&str> = Vec::new();
+        for work in &schedule.works {
+            let known = stages.iter().position(|name| *name == work.stage);
+            let position = known.unwrap_or_else(|| {
+                stages.push(&work.stage);
+                stages.len() - 1
             });
-        let mut at = stage_directory(directory, work);
-        if !at.join(metrics::METRICS).exists() {
-            // Found in the cache: its curves are where it was made, if that run is still there.
-            if let Some(made) = cache.made(&work.key) {
-                at = directory.runs().join(made.stage);
+            let mut at = stage_directory(directory, work);
+            if !at.join(metrics::METRICS).exists() {
+                // Found in the cache: its curves are where it was made, if that run is still there.
+                if let Some(made) = cache.made(&work.key) {
+                    at = directory.runs().join(made.stage);
+                }
+            }
+            let mut curves: BTreeMap<String, Vec<(f64, f64)>> = BTreeMap::new();
+            for row in metrics::read(&at)? {
+                for (name, value) in row.scalars {
+                    let points = curves.entry(name).or_default();
+                    points.push((row.step as f64, value));
+                }
+            }
+            for (metric, points) in curves {
+                let name = if schedule.sweep {
+                    work.cells.join(", ")
+                } else {
+                    String::new()
+                };
+                let held = found.entry((position, metric)).or_default();
+                held.push(Curve { name, points });
             }
         }
-        let mut curves: BTreeMap<String, Vec<(f64, f64)>> = BTreeMap::new();
-        for row in metrics::read(&at)? {
-            for (name, value) in row.scalars {
-                curves
-                    .entry(name)
-                    .or_default()
-                    .push((row.step as f64, value));
+        let (plots, once) = found
+            .into_iter()
+            .partition(|(_, curves)| curves.iter().any(|curve| curve.points.len() > 1));
+        Ok(Self {
+            stages,
+            plots,
+            once,
+        })
+    }
+
+    /// The curves that say whether training went well.
+    fn losses(&self, page: &mut String) {
+        let losses: Vec<_> = self.plots.iter().filter(|((_, m), _)| is_loss(m)).collect();
+        if !losses.is_empty() {
+            page.push_str("<h2>Losses</h2>\n");
+            self.draw(page, &losses);
+        }
+    }
+
+    /// The other curves, and a table of what was measured once.
+    fn others(&self, page: &mut String) {
+        let mut inside = String::new();
+        let others: Vec<_> = self
+            .plots
+            .iter()
+            .filter(|((_, m), _)| !is_loss(m))
+            .collect();
+        if !others.is_empty() {
+            self.draw(&mut inside, &others);
+        }
+        if !self.once.is_empty() {
+            inside.push_str(
+                "<table>\n<tr><th>stage</th><th>metric</th><th class=\"n\">value</th></tr>\n",
+            );
+            for ((stage, metric), curves) in &self.once {
+                let values = curves.iter().flat_map(|curve| &curve.points);
+                let value = spread(values.map(|(_, value)| *value));
+                let _ = writeln!(
+                    inside,
+                    "<tr><td>{}</td><td>{}</td><td class=\"n\">{value}</td></tr>",
+                    escape(self.stages[*stage]),
+                    escape(metric),
+                );
+            }
+            inside.push_str("</table>\n");
+        }
+        fold(page, "Other curves and numbers", &inside);
+    }
+
+    fn draw(&self, page: &mut String, plots: &[&((usize, String), Vec<Curve>)]) {
+        page.push_str("<div class=\"plots\">\n");
+        for ((stage, metric), curves) in plots.iter().take(MOST_PLOTS) {
+            let title = format!("{}: {metric}", self.stages[*stage]);
+            if let Some(svg) = curves::svg(&title, curves) {
+                image(page, "svg+xml", svg.as_bytes(), metric);
             }
         }
-        for (metric, points) in curves {
-            let name = if schedule.sweep {
-                work.cells.join(", ")
-            } else {
-                String::new()
-            };
-            plots
-                .entry((position, metric))
-                .or_default()
-                .push(Curve { name, points });
-        }
-    }
-    let (plots, once): (Vec<_>, Vec<_>) = plots
-        .into_iter()
-        .partition(|(_, curves)| curves.iter().any(|curve| curve.points.len() > 1));
-    if !plots.is_empty() {
-        page.push_str("<h2>Curves</h2>\n<div class=\"plots\">\n");
-    }
-    for ((stage, metric), curves) in plots.iter().take(MOST_PLOTS) {
-        if let Some(svg) = curves::svg(&format!("{}: {metric}", order[*stage]), curves) {
-            image(page, "svg+xml", svg.as_bytes(), metric);
-        }
-    }
-    if !plots.is_empty() {
         page.push_str("</div>\n");
+        if plots.len() > MOST_PLOTS {
+            let _ = writeln!(
+                page,
+                "<p>{} more are in the stages' <code>metrics.jsonl</code>.</p>",
+                plots.len() - MOST_PLOTS
+            );
+        }
     }
-    if plots.len() > MOST_PLOTS {
-        let _ = writeln!(
-            page,
-            "<p>{} more are in the stages' <code>metrics.jsonl</code>.</p>",
-            plots.len() - MOST_PLOTS
-        );
-    }
-    if once.is_empty() {
-        return Ok(());
-    }
-    page.push_str("<h2>Numbers</h2>\n<table>\n<tr><th>stage</th><th>metric</th><th class=\"n\">value</th></tr>\n");
-    for ((stage, metric), curves) in &once {
-        let values = curves.iter().flat_map(|curve| &curve.points);
-        let value = spread(values.map(|(_, value)| *value));
-        let _ = writeln!(
-            page,
-            "<tr><td>{}</td><td>{}</td><td class=\"n\">{value}</td></tr>",
-            escape(order[*stage]),
-            escape(metric),
-        );
-    }
-    page.push_str("</table>\n");
-    Ok(())
 }
 
 /// One number, or the least and the most; `NaN` where there is no other.
@@ -338,15 +422,19 @@ fn linked(
     std::fs::copy(&own, &copy).at("writing", &copy)?;
     let _ = writeln!(
         page,
-        "<h2>{}</h2>\n<p><a href=\"{name}\">See the reconstruction</a> (one page, works offline)</p>",
+        "<p><a href=\"{name}\">See the reconstruction</a> of <code>{}</code> (one page, works offline)</p>",
         escape(&work.label(schedule.sweep)),
         name = escape(&name),
     );
     Ok(())
 }
 
-fn origin(page: &mut String, directory: &RunDirectory) {
-    page.push_str("<h2>Settings and origin</h2>\n");
+fn origin(page: &mut String, run: &Run, directory: &RunDirectory) {
+    page.push_str("<table>\n");
+    for (name, value) in history(run) {
+        let _ = writeln!(page, "<tr><th>{name}</th><td>{}</td></tr>", escape(&value));
+    }
+    page.push_str("</table>\n");
     if let Ok(resolved) = std::fs::read_to_string(directory.path().join("resolved.yaml")) {
         let resolved = escape(&resolved);
         let _ = writeln!(

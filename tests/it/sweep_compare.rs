@@ -71,7 +71,11 @@ fn the_arms_of_a_sweep_are_compared_on_its_page() {
     let page = String::from_utf8(output.stdout).unwrap();
     let page = at(page.trim());
     let text = std::fs::read_to_string(&page).unwrap();
-    assert!(text.contains("<h2>Comparison</h2>"));
+    let (before, _) = text.split_once("<h2>Comparison</h2>").unwrap();
+    assert!(
+        before.contains("class=\"said\""),
+        "the conclusion opens the page"
+    );
     assert!(
         text.contains("90 % interval"),
         "the block decides the level"
