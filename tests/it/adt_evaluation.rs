@@ -92,7 +92,7 @@ fn the_adt_sample_is_evaluated_against_arrays_with_known_mistakes() {
     };
     let sample = shared.join("data/adt_sample");
     if !sample.is_dir() {
-        eprintln!("skipped: no ADT sample");
+        crate::skipped::skipped("no ADT sample");
         return;
     }
     let folder = tempfile::tempdir().unwrap();

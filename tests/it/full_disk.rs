@@ -134,7 +134,7 @@ fn a_run_on_a_full_disk_fails_cleanly_and_continues_with_more_space() {
         .arg(&disk)
         .output();
     if !allowed.is_ok_and(|output| output.status.success()) {
-        eprintln!("skipped: no disk of one's own in a user namespace here");
+        crate::skipped::skipped("no disk of one's own in a user namespace here");
         return;
     }
     let output = Command::new("unshare")

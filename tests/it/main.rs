@@ -27,6 +27,7 @@ mod recordings_video;
 mod schema;
 mod shared;
 mod shipped;
+mod skipped;
 mod statistics;
 mod sweep_compare;
 mod sweeps;

@@ -99,7 +99,7 @@ fn four_four_four_goes_through_ffmpeg_and_equals_its_pngs() {
     };
     assert!(reason.contains("4:4:4"), "{reason}");
     if !ffmpeg::available() {
-        eprintln!("skipped: no ffmpeg on the PATH");
+        crate::skipped::skipped("no ffmpeg on the PATH");
         return;
     }
     let clip = Video::open(&path)
@@ -124,7 +124,7 @@ fn four_four_four_goes_through_ffmpeg_and_equals_its_pngs() {
 fn both_decoders_give_the_same_clip() {
     let Some(path) = kitchen() else { return };
     if !ffmpeg::available() {
-        eprintln!("skipped: no ffmpeg on the PATH");
+        crate::skipped::skipped("no ffmpeg on the PATH");
         return;
     }
     let settings = VideoSettings {
@@ -292,7 +292,7 @@ fn squares_do_not_depend_on_the_number_of_threads() {
 #[test]
 fn thousands_of_chosen_frames_come_through_ffmpeg() {
     if !ffmpeg::available() {
-        eprintln!("skipped: no ffmpeg on the PATH");
+        crate::skipped::skipped("no ffmpeg on the PATH");
         return;
     }
     let folder = tempfile::tempdir().unwrap();
@@ -304,7 +304,7 @@ fn thousands_of_chosen_frames_come_through_ffmpeg() {
         .arg(&path)
         .status();
     if !made.is_ok_and(|status| status.success()) {
-        eprintln!("skipped: this ffmpeg makes no video");
+        crate::skipped::skipped("this ffmpeg makes no video");
         return;
     }
     let video = Video::open(&path).unwrap();

@@ -2,7 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
-/// `$REVIV_SHARED`, or `../shared` beside the repository; `None` (said on stderr) where neither exists, and the test skips.
+/// `$REVIV_SHARED`, or `../shared` beside the repository; `None` where neither exists: the test skips, and the last
+/// lines of the run say so.
 pub fn folder() -> Option<PathBuf> {
     let folder = std::env::var_os("REVIV_SHARED").map_or_else(
         || Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared"),
@@ -11,9 +12,9 @@ pub fn folder() -> Option<PathBuf> {
     if folder.is_dir() {
         return Some(folder);
     }
-    eprintln!(
-        "skipped: {} does not exist (set REVIV_SHARED)",
+    crate::skipped::skipped(&format!(
+        "{} does not exist (set REVIV_SHARED)",
         folder.display()
-    );
+    ));
     None
 }

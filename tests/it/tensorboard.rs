@@ -51,9 +51,9 @@ fn python() -> Option<String> {
     if found.is_ok_and(|output| output.status.success()) {
         return Some(python);
     }
-    eprintln!(
-        "skipped: `{python}` has no tensorboard (pip install tensorboard, or set REVIV_PYTHON)"
-    );
+    crate::skipped::skipped(&format!(
+        "`{python}` has no tensorboard (pip install tensorboard, or set REVIV_PYTHON)"
+    ));
     None
 }
 

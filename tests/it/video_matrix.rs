@@ -49,7 +49,7 @@ struct Place {
 impl Place {
     fn new() -> Option<Self> {
         if !ffmpeg::available() {
-            eprintln!("skipped: no ffmpeg on the PATH");
+            crate::skipped::skipped("no ffmpeg on the PATH");
             return None;
         }
         let folder = tempfile::tempdir().unwrap();

@@ -211,7 +211,7 @@ fn self_test(page: &std::path::Path, profile: &std::path::Path) -> Option<serde_
         .iter()
         .find_map(|b| run(b).ok())
     else {
-        eprintln!("skipped: no Chromium on the PATH");
+        crate::skipped::skipped("no Chromium on the PATH");
         return None;
     };
     let dom = String::from_utf8_lossy(&output.stdout).into_owned();
