@@ -24,8 +24,11 @@ mod view;
 mod why;
 
 use clap::{CommandFactory as _, Parser as _};
+use std::ffi::OsString;
 use std::process::ExitCode;
 
+pub use compare::entrants_of;
+pub use reconstruct::{artifact_of, find_model};
 pub use terminal::{Failure, Terminal};
 
 /// A command, parsed.
@@ -94,8 +97,13 @@ fn grammar() -> clap::Command {
 ///
 /// Exit codes: 0 done, 1 the user's input, 2 the machine or a bug, 130 stopped by Ctrl-C (the run continues when asked again).
 pub fn main() -> ExitCode {
+    ExitCode::from(main_with(std::env::args_os()))
+}
+
+/// As [`main`], on these arguments, the first of which is the program's name; gives the exit code.
+pub fn main_with(arguments: impl IntoIterator<Item = OsString>) -> u8 {
     let terminal = Terminal::new();
-    match Arguments::try_parse() {
+    match Arguments::try_parse_from(arguments) {
         Ok(arguments) => terminal.end(arguments.command.run(&terminal)),
         Err(error) => terminal.usage(&error),
     }

@@ -6,14 +6,17 @@ use super::terminal::{Failure, Terminal};
 use crate::engine::DeviceChoice;
 use crate::experiment::catalog::Catalog;
 use crate::experiment::load::Request;
+use crate::reconstruction::dataset::write_nerfstudio;
 use crate::reconstruction::folder::{FOLDER, Manifest, PAGE};
+use crate::reconstruction::overlay::{Overlay, OverlayError};
 use crate::reconstruction::predictions::ScaleStatus;
 use crate::run::execute::{Job, Outcome, execute};
 use crate::run::schedule::Schedule;
 use crate::run::{
     Cache, Interrupt, RunDirectory, RunError, Shard, State, WorkerPool, files, metrics,
 };
-use crate::video::DecoderChoice;
+use crate::video::{DecoderChoice, Video, VideoSettings};
+use crate::view::movie;
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 
@@ -23,6 +26,12 @@ const FILE: &str = "experiments/reconstruct.yaml";
 const STAGE: &str = "reconstruction";
 /// What lists the files of a result.
 const MANIFEST: &str = "manifest.json";
+/// The video with what was reconstructed drawn in: by `ffmpeg`, or without.
+const OVERLAYS: [&str; 2] = ["overlay.mp4", "overlay.avi"];
+/// The folder of a data set for NerfStudio.
+const NERFSTUDIO: &str = "nerfstudio";
+/// The kind of a model among artifacts.
+const MODEL: &str = "mget";
 
 /// Reconstruct the wearer and the world from one video
 ///
@@ -54,6 +63,12 @@ pub struct Reconstruct {
     /// At most so many seconds of the video
     #[arg(long, value_name = "SECONDS")]
     seconds: Option<f64>,
+    /// Also draw skeleton, hands and gaze into the video: `overlay.mp4`, or `overlay.avi` where there is no `ffmpeg`
+    #[arg(long = "video")]
+    overlay: bool,
+    /// Also write for another program: `nerfstudio` makes a data set of pictures and cameras (`ns-train splatfacto --data DIR`)
+    #[arg(long, value_enum, value_name = "PROGRAM")]
+    export: Vec<Export>,
     /// Who decodes the video
     #[arg(long, value_enum, value_name = "DECODER")]
     decoder: Option<DecoderChoice>,
@@ -70,6 +85,12 @@ pub struct Reconstruct {
     place: RunsDir,
 }
 
+/// Another program that what is found is written for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+enum Export {
+    Nerfstudio,
+}
+
 impl super::Run for Reconstruct {
     fn run(self, terminal: &Terminal) -> Result<(), Failure> {
         if !self.video.exists() {
@@ -79,7 +100,8 @@ impl super::Run for Reconstruct {
             ));
         }
         let target = self.target()?;
-        let model = self.find_model(terminal)?;
+        let model = find_model(&self.place.runs, self.model.as_deref())
+            .map_err(|error| tell(terminal, &error))?;
         let request = self.request(&model)?;
         terminal.note(format_args!(
             "experiment  {}\nmodel       {}\n",
@@ -108,6 +130,7 @@ impl super::Run for Reconstruct {
             )
         })?;
         publish(&artifact.join(FOLDER), &target).map_err(|error| tell(terminal, &error))?;
+        self.write_more(terminal, &outcome, &target)?;
         Self::report(terminal, &outcome, &target)
     }
 }
@@ -123,6 +146,40 @@ impl Reconstruct {
             Some(_) => Ok(target),
             None => Err(Failure::input(occupied(&target), ANOTHER)),
         }
+    }
+
+    /// What needs the video once more, beside the result: the overlay, and pictures for other programs.
+    fn write_more(
+        &self,
+        terminal: &Terminal,
+        outcome: &Outcome,
+        target: &Path,
+    ) -> Result<(), Failure> {
+        if !self.overlay && self.export.is_empty() {
+            return Ok(());
+        }
+        let name = OVERLAYS[usize::from(!movie::ffmpeg())];
+        if self.overlay && name != OVERLAYS[0] {
+            terminal.note("no `ffmpeg`: the overlay is Motion JPEG, which browsers do not play\n");
+        }
+        let write = || -> Result<(), OverlayError> {
+            let video = Video::open_with(&self.video, &reading(outcome))?;
+            if self.overlay {
+                Overlay::open(target)?.write(&video, &target.join(name))?;
+            }
+            for export in &self.export {
+                match export {
+                    Export::Nerfstudio => {
+                        write_nerfstudio(target, &video, &target.join(NERFSTUDIO))?;
+                    }
+                }
+            }
+            Ok(())
+        };
+        write().map_err(|error| match error {
+            OverlayError::Folder { .. } => Failure::input(error.to_string(), "see `targets`"),
+            error => Failure::machine(error),
+        })
     }
 
     /// The experiment with the video, the model and the other flags.
@@ -172,40 +229,6 @@ impl Reconstruct {
         })
     }
 
-    /// The folder of the model.
-    fn find_model(&self, terminal: &Terminal) -> Result<PathBuf, Failure> {
-        let runs = &self.place.runs;
-        if let Some(given) = &self.model {
-            if given.join("run.json").is_file() || !given.exists() {
-                let run =
-                    RunDirectory::named(runs, given).map_err(|error| tell(terminal, &error))?;
-                return model_of(&run).ok_or_else(|| {
-                    Failure::input(
-                        format!("run `{}` has no finished model of its own", run.name()),
-                        "name a run with a `train_mget` stage, or a model folder",
-                    )
-                });
-            }
-            return Ok(given.clone());
-        }
-        let mut finished: Vec<(String, RunDirectory)> = RunDirectory::all(runs)
-            .map_err(|error| tell(terminal, &error))?
-            .into_iter()
-            .filter_map(|run| Some((run.read().ok()?.created, run)))
-            .collect();
-        finished.sort_by(|a, b| b.0.cmp(&a.0));
-        finished
-            .iter()
-            .find_map(|(_, run)| model_of(run))
-            .ok_or_else(|| {
-                Failure::input(
-                    format!("no model at hand: no run in `{}` trained one", runs.display()),
-                    "`reviv run experiments/quickstart.yaml` trains a small one in minutes; `reviv import` reads released \
-                     weights; `--model` takes either",
-                )
-            })
-    }
-
     /// What was made, what was assumed, and where the time went.
     fn report(terminal: &Terminal, outcome: &Outcome, target: &Path) -> Result<(), Failure> {
         let manifest: Manifest =
@@ -230,6 +253,17 @@ impl Reconstruct {
                 let each = seconds / row.step.max(1) as f64;
                 let _ = writeln!(text, "{part:<16}{seconds:>8.2} s {each:>8.3} s per window");
             }
+        }
+        if let Some(name) = OVERLAYS.iter().find(|name| target.join(name).is_file()) {
+            let _ = writeln!(text, "\n{:<12}{}", "Overlay", target.join(name).display());
+        }
+        if target.join(NERFSTUDIO).is_dir() {
+            let _ = writeln!(
+                text,
+                "{:<12}{}",
+                "NerfStudio",
+                target.join(NERFSTUDIO).display()
+            );
         }
         terminal.note(text);
         terminal.data(format_args!("{}\n", target.join(PAGE).display()));
@@ -256,19 +290,55 @@ fn text(path: &Path) -> Result<String, Failure> {
     Ok(serde_json::Value::from(text).to_string())
 }
 
-/// The model that a run trained, or used: the last one of its plan that is in the cache.
-fn model_of(run: &RunDirectory) -> Option<PathBuf> {
+/// The folder of a model: `given` is one, or a run that trained one; without it, the latest run that did.
+///
+/// # Errors
+/// When there is none.
+pub fn find_model(runs: &Path, given: Option<&Path>) -> Result<PathBuf, RunError> {
+    if let Some(given) = given {
+        if given.join("run.json").is_file() || !given.exists() {
+            let run = RunDirectory::named(runs, given)?;
+            return artifact_of(&run, MODEL).ok_or_else(|| RunError::Request {
+                message: format!("run `{}` has no finished model of its own", run.name()),
+                help: "name a run with a `train_mget` stage, or a model folder".into(),
+            });
+        }
+        return Ok(given.to_owned());
+    }
+    let mut finished: Vec<(String, RunDirectory)> = RunDirectory::all(runs)?
+        .into_iter()
+        .filter_map(|run| Some((run.read().ok()?.created, run)))
+        .collect();
+    finished.sort_by(|a, b| b.0.cmp(&a.0));
+    let models = finished.iter();
+    let mut models = models.filter_map(|(_, run)| artifact_of(run, MODEL));
+    models.next().ok_or_else(|| RunError::Request {
+        message: format!("no model at hand: no run in `{}` trained one", runs.display()),
+        help: "`reviv run experiments/quickstart.yaml` trains a small one in minutes; `reviv import` reads released \
+               weights; `--model` takes either"
+            .into(),
+    })
+}
+
+/// What a run made, or used, of this kind (`mget`, `clips`, `tokens`): the last one of its plan that is in the cache.
+pub fn artifact_of(run: &RunDirectory, kind: &str) -> Option<PathBuf> {
     let schedule: Schedule = files::read_json(&run.path().join("plan.json")).ok()?;
     let cache = Cache::of(run.runs());
-    let models = schedule
-        .works
-        .iter()
-        .rev()
-        .filter(|work| work.kind == "mget");
-    models
-        .filter(|work| cache.contains(&work.key))
+    let made = schedule.works.iter().rev().filter(|work| work.kind == kind);
+    made.filter(|work| cache.contains(&work.key))
         .map(|work| cache.path(&work.key))
         .next()
+}
+
+/// How the stage read the video.
+fn reading(outcome: &Outcome) -> VideoSettings {
+    let schedule: Option<Schedule> = files::read_json(&outcome.run.path().join("plan.json")).ok();
+    let works = schedule.into_iter().flat_map(|schedule| schedule.works);
+    let mut stages = works.filter(|work| work.stage == STAGE);
+    let settings = stages.next().map(|work| work.settings["reading"].clone());
+    settings
+        .and_then(|settings| serde_json::from_value(settings).ok())
+        .unwrap_or_default()
 }
 
 fn finished(terminal: &Terminal, outcome: &Outcome, interrupt: &Interrupt) -> Result<(), Failure> {
@@ -295,7 +365,10 @@ fn earlier(target: &Path) -> Option<Vec<PathBuf>> {
     }
     let manifest: Manifest = files::read_json(&target.join(MANIFEST)).ok()?;
     let own = |file: &PathBuf| {
-        file == Path::new(MANIFEST) || manifest.files.iter().any(|name| file == Path::new(name))
+        file == Path::new(MANIFEST)
+            || file.starts_with(NERFSTUDIO)
+            || OVERLAYS.iter().any(|name| file == Path::new(name))
+            || manifest.files.iter().any(|name| file == Path::new(name))
     };
     let found = files::files_below(target).ok()?;
     found.iter().all(own).then_some(found)

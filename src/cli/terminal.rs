@@ -2,7 +2,6 @@
 
 use std::fmt::Display;
 use std::io::IsTerminal as _;
-use std::process::ExitCode;
 use std::sync::OnceLock;
 
 /// Why a command failed.
@@ -82,7 +81,7 @@ impl Terminal {
     }
 
     /// Prints what the command line itself has to say: help and version to stdout, mistakes to stderr.
-    pub fn usage(&self, error: &clap::Error) -> ExitCode {
+    pub fn usage(&self, error: &clap::Error) -> u8 {
         match error.print() {
             Err(failed)
                 if !error.use_stderr() && failed.kind() != std::io::ErrorKind::BrokenPipe =>
@@ -99,11 +98,11 @@ impl Terminal {
         })
     }
 
-    /// The end of the process: says why the command failed, and that what it printed did not arrive.
-    pub fn end(&self, result: Result<(), Failure>) -> ExitCode {
+    /// The end of the process: says why the command failed, and that what it printed did not arrive. Gives the exit code.
+    pub fn end(&self, result: Result<(), Failure>) -> u8 {
         let lost = self.lost.get().cloned().map(Failure::Machine);
         match (result, lost) {
-            (Ok(()), None) => ExitCode::SUCCESS,
+            (Ok(()), None) => 0,
             (Ok(()), Some(failure)) | (Err(failure), None) => self.fail(failure),
             (Err(failure), Some(lost)) => {
                 self.fail(lost);
@@ -119,20 +118,20 @@ impl Terminal {
     }
 
     /// Says why the command failed; gives the exit code.
-    fn fail(&self, failure: Failure) -> ExitCode {
+    fn fail(&self, failure: Failure) -> u8 {
         match failure {
-            Failure::Reported => ExitCode::from(1),
-            Failure::Ended(code) => ExitCode::from(code),
+            Failure::Reported => 1,
+            Failure::Ended(code) => code,
             Failure::Input { message, help } => {
                 self.note(format_args!("error: {message}\n"));
                 if !help.is_empty() {
                     self.note(format_args!("hint: {help}\n"));
                 }
-                ExitCode::from(1)
+                1
             }
             Failure::Machine(message) => {
                 self.note(format_args!("error: {message}\n"));
-                ExitCode::from(2)
+                2
             }
         }
     }

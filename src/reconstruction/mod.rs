@@ -4,10 +4,11 @@
 //! [`reconstruct()`] is the whole: read [`mod@reconstruct`] (the loop), [`recording`] (what it reads), [`result`] (what it gives).
 //! Its parts are [`lens`] (the camera, given or assumed), [`windows`] (how a video is cut), [`mod@track`], [`stitch`] and [`depth`] (how windows become one), [`scale`] (metric depth from the
 //! floor or from another model), [`predictions`] (decoded signals of single clips, for evaluation), then [`export`] (files for
-//! other programs).
+//! other programs) and [`overlay`] (the wearer drawn into the video), [`dataset`] (pictures with cameras, for view synthesis).
 
 pub mod anchor;
 pub mod cloud;
+pub mod dataset;
 pub mod depth;
 mod error;
 pub mod export;
@@ -15,6 +16,7 @@ pub mod folder;
 mod folder_error;
 pub mod frame_buffer;
 pub mod lens;
+pub mod overlay;
 pub mod predictions;
 pub mod reconstruct;
 pub mod recording;

@@ -190,6 +190,7 @@ pub fn reconstruct_recording(
     };
     let info = ReconstructionInfo {
         title: recording.title.clone(),
+        start: recording.start(),
         video_rate: rate,
         frames,
         samples: samples_of(recording.seconds),

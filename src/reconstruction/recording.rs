@@ -204,6 +204,15 @@ impl Recording {
         })
     }
 
+    /// Where in the video it starts, seconds.
+    #[must_use]
+    pub fn start(&self) -> f64 {
+        match &self.frames {
+            Frames::Video { start, .. } => *start,
+            Frames::Clip(_) => 0.0,
+        }
+    }
+
     /// The frames of these windows, as the model takes them.
     pub(super) fn stream<'a>(
         &'a self,

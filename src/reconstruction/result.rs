@@ -20,6 +20,8 @@ use std::marker::PhantomData;
 pub struct ReconstructionInfo {
     /// The video's or the clip's name.
     pub title: String,
+    /// Where in the video it starts, seconds.
+    pub start: f64,
     /// Hz of the model's video.
     pub video_rate: f64,
     /// Video frames and motion samples of the whole reconstruction.
@@ -84,6 +86,12 @@ impl Reconstruction {
     #[must_use]
     pub fn seconds(&self) -> f64 {
         self.info.samples as f64 / SIGNAL_RATE
+    }
+
+    /// Frames per second of the video that the model saw, and of the depth.
+    #[must_use]
+    pub fn video_rate(&self) -> f64 {
+        self.info.video_rate
     }
 
     /// `T_world_camera` (metres, OpenCV axes) at 30 Hz; empty where no camera was reconstructed.

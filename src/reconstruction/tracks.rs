@@ -21,6 +21,8 @@ use crate::view::{Drawing, Part};
 use nalgebra::{Point3, Quaternion, UnitQuaternion, Vector3};
 use ndarray::{Array1, Array2, Array3};
 
+/// The unit of points in the image.
+const SQUARE: &str = "share of the image: x right, y down";
 const WORLD: &str = "world: z up, origin and heading of the first camera";
 
 fn learned() -> ScaleStatus {
@@ -137,6 +139,16 @@ impl Track for GazePath {
     }
 
     fn write(&self, files: &mut Files<'_>) -> Result<(), FolderError> {
+        let facts = files.facts(
+            "gaze",
+            SQUARE,
+            "upright square image",
+            ScaleStatus::None,
+            None,
+        );
+        let count = self.points.len();
+        let values = Array2::from_shape_fn((count, 2), |(t, k)| self.points[t][k]);
+        files.array("gaze.npz", values, facts);
         files.file("gaze.csv", |out| write_gaze(SIGNAL_RATE, &self.points, out))
     }
 

@@ -1,8 +1,9 @@
 //! The only place that looks at the machine, at git and at the clock.
 
 use serde::{Deserialize, Serialize};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::sync::OnceLock;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 /// What a run was made with, as `lock.json` keeps it.
@@ -33,11 +34,20 @@ pub struct Git {
     pub patch: Vec<u8>,
 }
 
+/// The file that this program is, where the process belongs to another: a module of Python.
+static PROGRAM: OnceLock<PathBuf> = OnceLock::new();
+
+/// Says which file the program is, where it is not the process's own; the first word stands.
+pub fn program_is(path: PathBuf) {
+    PROGRAM.get_or_init(|| path);
+}
+
 impl Environment {
     /// Looks at the machine, and at the git work tree around `project`.
     pub fn look(project: &Path) -> Self {
-        let binary = std::env::current_exe()
-            .ok()
+        let own = PROGRAM.get().cloned();
+        let binary = own
+            .or_else(|| std::env::current_exe().ok())
             .and_then(|path| super::files::hash(&path).ok())
             .map(|(hash, _)| hash.to_hex().to_string());
         Self {

@@ -136,7 +136,7 @@ impl RunDirectory {
         })
     }
 
-    /// A run by its path, its name below `runs`, or the beginning or end of that name where only one fits.
+    /// A run by its path, its name below `runs`, or, where only one fits, the beginning or end of that name or the experiment's.
     pub fn named(runs: &Path, name: impl AsRef<Path>) -> Result<Self, RunError> {
         let name = name.as_ref();
         let found = Self::fitting(runs, name)?;
@@ -167,7 +167,12 @@ impl RunDirectory {
         let name = name.as_os_str().as_encoded_bytes();
         all.retain(|run| {
             let whole = run.path.file_name().unwrap_or_default().as_encoded_bytes();
-            whole.starts_with(name) || whole.ends_with(name)
+            // `0131-EXPERIMENT-1a2b`
+            let dash = |at: Option<usize>| at.unwrap_or(0);
+            let first = dash(whole.iter().position(|byte| *byte == b'-'));
+            let last = dash(whole.iter().rposition(|byte| *byte == b'-'));
+            let experiment = whole.get(first + 1..last);
+            whole.starts_with(name) || whole.ends_with(name) || experiment == Some(name)
         });
         Ok(all)
     }

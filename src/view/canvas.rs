@@ -1,6 +1,7 @@
 //! A small picture to draw on: rectangles, smooth lines and discs, other pictures, and words in capitals.
 
 use crate::formats::png::Picture;
+use crate::video::image::Image;
 use ndarray::Array3;
 
 /// Red, green, blue.
@@ -84,6 +85,20 @@ impl Canvas {
             height,
             data: colour.repeat(width * height),
         }
+    }
+
+    /// A picture to draw into.
+    pub fn of(image: Image) -> Self {
+        Canvas {
+            width: image.width as usize,
+            height: image.height as usize,
+            data: image.data,
+        }
+    }
+
+    /// Its pixels, row by row.
+    pub fn rgb(&self) -> &[u8] {
+        &self.data
     }
 
     /// Width and height in pixels.

@@ -1,5 +1,6 @@
 //! What a person looks at: the self-contained page that shows a reconstruction (one HTML file, no network, no server), and
-//! pictures of what clips hold ([`contact`], [`paths`], both on a [`canvas`]).
+//! pictures of what clips hold ([`contact`], [`paths`], both on a [`canvas`]); and the wearer drawn into their own video
+//! ([`overlay`], [`movie`]).
 //!
 //! Read [`scene`] (what can be shown), then [`page`] (how it becomes one file). The page itself is `page/`: `page.html` with
 //! `page.css`, and a script in three parts, `data.js` (manifest and blobs), `draw.js` (WebGL2), `main.js` (layers, cameras,
@@ -10,6 +11,8 @@ pub mod canvas;
 pub mod cloud;
 pub mod contact;
 pub mod depth_sheet;
+pub mod movie;
+pub mod overlay;
 pub mod page;
 pub mod paths;
 pub mod scene;

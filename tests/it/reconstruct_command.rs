@@ -214,6 +214,9 @@ fn a_video_becomes_a_complete_folder_and_the_same_bytes_again() {
         "hands.npz",
         "depth.npz",
         "points.ply",
+        "scene.glb",
+        "gaze.npz",
+        "confidence.npz",
         "view.html",
         "manifest.json",
     ] {
@@ -231,6 +234,32 @@ fn a_video_becomes_a_complete_folder_and_the_same_bytes_again() {
         .assert()
         .success();
     assert!(one == files(&place.path("two")), "two runs differ");
+}
+
+#[test]
+fn what_is_made_from_the_video_once_more_needs_no_second_reconstruction_and_is_no_foreign_file() {
+    let place = Place::new();
+    pictures(&place.path("walk"), 70, [48, 40], false);
+    place.command("walk", "one").assert().success();
+    let said = place
+        .command("walk", "one")
+        .args(["--video", "--export", "nerfstudio"])
+        .assert()
+        .success();
+    let said = String::from_utf8_lossy(&said.get_output().stderr).into_owned();
+    assert!(
+        said.contains("Overlay") && said.contains("NerfStudio"),
+        "{said}"
+    );
+    let own = files(&place.path("one"));
+    let movie = own.get("overlay.mp4").or(own.get("overlay.avi"));
+    assert!(movie.is_some_and(|movie| movie.len() > 10_000));
+    let data: serde_json::Value =
+        serde_json::from_slice(&files(&place.path("one/nerfstudio"))["transforms.json"]).unwrap();
+    // 70 pictures at 30 a second, eight of them a second.
+    assert_eq!(data["frames"].as_array().unwrap().len(), 19);
+    assert_eq!(files(&place.path("one/nerfstudio/images")).len(), 19);
+    place.command("walk", "one").assert().success();
 }
 
 #[test]

@@ -121,6 +121,7 @@ fn decoded(start: usize, wrong: [f64; 2]) -> Clip {
 
 fn setting(seconds: f64) -> ReconstructionInfo {
     ReconstructionInfo {
+        start: 0.0,
         title: "walk".into(),
         video_rate: 8.0,
         frames: (seconds * 8.0).ceil() as usize,
@@ -196,6 +197,7 @@ fn a_walk_becomes_metric_and_every_file_is_there() {
         "left_hand.bvh",
         "manifest.json",
         "points.ply",
+        "scene.glb",
         "view.html",
     ] {
         assert!(

@@ -68,7 +68,7 @@ pub fn from_camera() -> UnitQuaternion<f64> {
     UnitQuaternion::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI)
 }
 
-fn known(frames: &[Joints], up: &UnitQuaternion<f64>) -> Vec<Vec<Vector3<f64>>> {
+pub(super) fn known(frames: &[Joints], up: &UnitQuaternion<f64>) -> Vec<Vec<Vector3<f64>>> {
     let mut poses: Vec<Vec<Vector3<f64>>> = Vec::with_capacity(frames.len());
     for frame in frames {
         if frame.iter().flatten().all(|v| v.is_finite()) {
@@ -85,7 +85,7 @@ fn known(frames: &[Joints], up: &UnitQuaternion<f64>) -> Vec<Vec<Vector3<f64>>> 
     poses
 }
 
-fn children(skeleton: &Skeleton, joint: usize) -> impl Iterator<Item = usize> + '_ {
+pub(super) fn children(skeleton: &Skeleton, joint: usize) -> impl Iterator<Item = usize> + '_ {
     (0..JOINTS).filter(move |&c| c != joint && skeleton.parents[c] == joint)
 }
 
@@ -98,7 +98,7 @@ fn depth_first(skeleton: &Skeleton, joint: usize) -> Vec<usize> {
 }
 
 /// Directions of the first pose with median lengths.
-fn rest_offsets(
+pub(super) fn rest_offsets(
     skeleton: &Skeleton,
     first: &[Vector3<f64>],
     poses: &[Vec<Vector3<f64>>],
@@ -120,7 +120,7 @@ fn rest_offsets(
 }
 
 /// World rotation of every joint: the rotation of its rest bones that fits the observed ones best.
-fn rotations(
+pub(super) fn rotations(
     skeleton: &Skeleton,
     rest: &[Vector3<f64>],
     pose: &[Vector3<f64>],

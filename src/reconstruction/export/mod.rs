@@ -1,4 +1,4 @@
-//! Files for other programs: TUM and COLMAP cameras, gaze csv, BVH, PLY, and npz with a manifest.
+//! Files for other programs: TUM, COLMAP and NerfStudio cameras, gaze csv, BVH, glTF, PLY, and npz with a manifest.
 //!
 //! Every writer takes plain data and an `impl Write`, so that it can be tested without a disk. The conventions each format needs
 //! are in its module.
@@ -6,7 +6,9 @@
 pub mod bvh;
 pub mod camera;
 pub mod files;
+pub mod gltf;
 pub mod manifest;
+pub mod nerfstudio;
 pub mod ply;
 
 use std::io::Write;

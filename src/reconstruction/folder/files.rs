@@ -1,11 +1,18 @@
 //! The arrays and exports of a reconstruction folder.
 
 use super::{FolderError, Manifest};
+use crate::clip::clock::SIGNAL_RATE;
+use crate::geometry::rigid::Rigid;
+use crate::geometry::skeleton::{BODY, HAND, Joints};
 use crate::reconstruction::export::files::Files;
+use crate::reconstruction::export::gltf::{Camera, Wearer, write_glb};
 use crate::reconstruction::export::manifest::ArrayFacts;
 use crate::reconstruction::export::ply::write_ply;
+use crate::reconstruction::predictions::ScaleStatus;
 use crate::reconstruction::result::Reconstruction;
 use crate::reconstruction::scale::NEAREST;
+use nalgebra::Point3;
+use ndarray::Array1;
 use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::Path;
@@ -21,10 +28,62 @@ impl Reconstruction {
         for (_, track) in self.tracks.iter() {
             track.write(&mut files)?;
         }
+        for (name, values) in &self.confidence {
+            let facts = files.facts(
+                name,
+                "0 (a guess) to 1 (certain)",
+                "of the tokens, by their entropy; not an accuracy",
+                ScaleStatus::None,
+                None,
+            );
+            files.array("confidence.npz", &Array1::from(values.clone()), facts);
+        }
         let (arrays, names) = files.finish()?;
         manifest.arrays.extend(arrays);
         manifest.files.extend(names);
         Ok(())
+    }
+
+    /// Skeletons and camera in one scene; nothing where neither was reconstructed.
+    pub(super) fn write_scene(
+        &self,
+        path: &Path,
+        manifest: &mut Manifest,
+    ) -> Result<(), FolderError> {
+        let cameras = self.tracks.camera();
+        // Hands are known in the camera; the scene has one world.
+        let in_world = |poses: &[Joints]| -> Vec<Joints> {
+            let place = |(pose, camera): (&Joints, &Rigid)| {
+                pose.map(|p| {
+                    let at = camera * Point3::from(p.map(f64::from));
+                    [at.x as f32, at.y as f32, at.z as f32]
+                })
+            };
+            poses.iter().zip(cameras).map(place).collect()
+        };
+        let left = in_world(self.tracks.left_hand());
+        let right = in_world(self.tracks.right_hand());
+        let parts = [
+            ("body", &BODY, self.tracks.body(), [0.47, 0.86, 0.55]),
+            ("left_hand", &HAND, left.as_slice(), [0.27, 0.67, 1.0]),
+            ("right_hand", &HAND, right.as_slice(), [1.0, 0.43, 0.27]),
+        ];
+        let wearers = parts.map(|(name, skeleton, poses, colour)| Wearer {
+            name,
+            skeleton,
+            poses,
+            colour,
+        });
+        if cameras.is_empty() && wearers.iter().all(|wearer| wearer.poses.is_empty()) {
+            return Ok(());
+        }
+        let camera = Camera {
+            poses: cameras,
+            lens: &self.info.intrinsics,
+        };
+        write_file(path, "scene.glb", &mut manifest.files, |out| {
+            write_glb(SIGNAL_RATE, &wearers, Some(&camera), out).map_err(FolderError::io(path))
+        })
     }
 
     pub(super) fn write_points(

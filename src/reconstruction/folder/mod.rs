@@ -45,6 +45,9 @@ pub struct Manifest {
     pub title: String,
     /// Label and value: what was assumed.
     pub assumptions: Vec<[String; 2]>,
+    /// Where in the video it starts.
+    #[serde(default)]
+    pub start_seconds: f64,
     pub seconds: f64,
     pub intrinsics: Intrinsics,
     pub scale: ScaleStatus,
@@ -281,21 +284,17 @@ impl Builder {
 }
 
 impl Reconstruction {
-    /// Writes arrays, exports, manifest and page into `folder`, which is made where it is missing; the files are the same for
-    /// the same reconstruction, wherever its depth was held.
-    ///
-    /// # Errors
-    /// When a file cannot be written.
-    pub fn write(&self, folder: impl AsRef<Path>) -> Result<Manifest, FolderError> {
-        let path = folder.as_ref();
-        std::fs::create_dir_all(path).map_err(FolderError::io(path))?;
+    /// What is known of it as a whole, before any file is written: the manifest of the folder, without `arrays` and `files`.
+    #[must_use]
+    pub fn manifest(&self) -> Manifest {
         let assumptions = self.info.assumptions.iter();
         let confidence = self.confidence.iter();
-        let mut manifest = Manifest {
+        Manifest {
             title: self.info.title.clone(),
             assumptions: assumptions
                 .map(|f| [f.label.clone(), f.value.clone()])
                 .collect(),
+            start_seconds: self.info.start,
             seconds: self.seconds(),
             intrinsics: self.info.intrinsics,
             scale: self.depth.scale.clone(),
@@ -306,13 +305,30 @@ impl Reconstruction {
             depth_seams: self.depth.boundaries.clone(),
             confidence: confidence.map(|(k, v)| (k.clone(), mean(v))).collect(),
             files: Vec::new(),
-        };
+        }
+    }
+
+    /// The page alone: one HTML file that needs no network.
+    ///
+    /// # Errors
+    /// When writing fails.
+    pub fn write_view(&self, out: &mut impl Write) -> Result<(), FolderError> {
+        Ok(write_page(&self.page(&self.manifest()), out)?)
+    }
+
+    /// Writes arrays, exports, manifest and page into `folder`, which is made where it is missing; the files are the same for
+    /// the same reconstruction, wherever its depth was held.
+    ///
+    /// # Errors
+    /// When a file cannot be written.
+    pub fn write(&self, folder: impl AsRef<Path>) -> Result<Manifest, FolderError> {
+        let path = folder.as_ref();
+        std::fs::create_dir_all(path).map_err(FolderError::io(path))?;
+        let mut manifest = self.manifest();
         self.write_tracks(path, &mut manifest)?;
+        self.write_scene(path, &mut manifest)?;
         self.write_points(path, &mut manifest)?;
-        let page = self.page(&manifest);
-        write_file(path, PAGE, &mut manifest.files, |out| {
-            Ok(write_page(&page, out)?)
-        })?;
+        write_file(path, PAGE, &mut manifest.files, |out| self.write_view(out))?;
         self.write_depth(path, &mut manifest)?;
         manifest.files.push("manifest.json".into());
         manifest.files.sort();
