@@ -15,6 +15,10 @@ test:
 ci:
     .ci/run
 
+# The Python package, into the Python that runs it.
+wheel:
+    pip install .
+
 # A fast look while editing.
 check:
     cargo clippy --all-targets -- -D warnings
