@@ -2,7 +2,7 @@
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
-use reviv::video::h264::Configuration;
+use reviv_data::video::h264::Configuration;
 
 fuzz_target!(|bytes: &[u8]| {
     if let Ok(configuration) = Configuration::parse(bytes) {
@@ -11,7 +11,7 @@ fuzz_target!(|bytes: &[u8]| {
         for start in [0, 8, 32, 64] {
             let sample = bytes.get(start..).unwrap_or_default();
             let _ = configuration.is_disposable(sample);
-            let _ = configuration.is_intra(sample);
+            let _ = configuration.is_start(sample);
         }
     }
 });

@@ -2,7 +2,7 @@
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
-use reviv::formats::npy;
+use reviv_data::formats::npy;
 
 fuzz_target!(|bytes: &[u8]| {
     if let Ok(array) = npy::parse(bytes) {

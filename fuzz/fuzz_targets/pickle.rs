@@ -2,7 +2,7 @@
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
-use reviv::formats::pickle::Pickle;
+use reviv_data::formats::pickle::Pickle;
 
 fuzz_target!(|bytes: &[u8]| {
     let _ = Pickle::parse(bytes);

@@ -2,11 +2,10 @@
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
-use reviv::datasets::aria::vrs::layout::Layout;
-use reviv::datasets::aria::{calibration, gaze, hand_tracking, trajectory};
-use reviv::datasets::csv::Lines;
-use reviv::datasets::umetrack::HandProfile;
-use reviv::evaluation::tum;
+use reviv_data::datasets::aria::vrs::layout::Layout;
+use reviv_data::datasets::aria::{calibration, gaze, hand_tracking, trajectory};
+use reviv_data::datasets::csv::Lines;
+use reviv_data::datasets::umetrack::HandProfile;
 
 fuzz_target!(|bytes: &[u8]| {
     let Some((kind, text)) = bytes.split_first() else {
@@ -15,14 +14,13 @@ fuzz_target!(|bytes: &[u8]| {
     let file = tempfile::NamedTempFile::new().expect("the temporary folder can be written");
     std::fs::write(file.path(), text).expect("the temporary folder can be written");
     let path = file.path();
-    match kind % 8 {
+    match kind % 7 {
         0 => drop(calibration::online(path, 1408)),
         1 => drop(HandProfile::read(path)),
         2 => drop(trajectory::read(path)),
         3 => drop(gaze::read(path)),
         4 => drop(hand_tracking::read(path)),
-        5 => drop(tum::read_tum(path)),
-        6 => drop(std::str::from_utf8(text).map(Layout::parse)),
+        5 => drop(std::str::from_utf8(text).map(Layout::parse)),
         _ => {
             if let Ok(lines) = Lines::open(path) {
                 let _ = lines.map_while(Result::ok).count();

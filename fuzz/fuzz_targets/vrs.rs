@@ -2,8 +2,8 @@
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
-use reviv::datasets::aria::vrs::image::Pictures;
-use reviv::datasets::aria::vrs::{Kind, StreamId, Vrs};
+use reviv_data::datasets::aria::vrs::image::Pictures;
+use reviv_data::datasets::aria::vrs::{Kind, StreamId, Vrs};
 use std::sync::Arc;
 
 /// Records of a file that are looked at: the fuzzer shall look at many files.

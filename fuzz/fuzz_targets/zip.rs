@@ -2,7 +2,7 @@
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
-use reviv::formats::zip::ZipArchive;
+use reviv_data::formats::zip::ZipArchive;
 use std::io::Cursor;
 
 /// Bytes of an entry that are asked for.
