@@ -4,14 +4,14 @@
 //! the tests. Aim: a 2 s clip of 1080p30 in at most 1.3 s with the embedded decoder, 0.8 s with `ffmpeg`; shards at
 //! 200 MB/s or more.
 
-use reviv::clip::store::ClipSet;
-use reviv::datasets::aria::vrs::Vrs;
-use reviv::datasets::convert::{ConvertSettings, Share, convert};
-use reviv::datasets::recording::CutSettings;
-use reviv::datasets::shards::TarSink;
-use reviv::datasets::{ClipSource, mps};
-use reviv::video::{DecoderChoice, Video, VideoSettings, ffmpeg};
-use reviv::world::{World, WorldClips, WorldSettings};
+use reviv_data::clip::store::ClipSet;
+use reviv_data::datasets::aria::vrs::Vrs;
+use reviv_data::datasets::convert::{ConvertSettings, Share, convert};
+use reviv_data::datasets::recording::CutSettings;
+use reviv_data::datasets::shards::TarSink;
+use reviv_data::datasets::{ClipSource, mps};
+use reviv_data::video::{DecoderChoice, Video, VideoSettings, ffmpeg};
+use reviv_data::world::{World, WorldClips, WorldSettings};
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -22,7 +22,7 @@ fn main() {
 
 fn shared(name: &str) -> Option<PathBuf> {
     let root = std::env::var_os("REVIV_SHARED").map_or_else(
-        || Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared"),
+        || Path::new(env!("CARGO_MANIFEST_DIR")).join("../../../shared"),
         PathBuf::from,
     );
     let path = root.join("data").join(name);
@@ -153,7 +153,7 @@ fn squares_1080p30_embedded(bencher: divan::Bencher<'_, '_>) {
 
 #[divan::bench(sample_count = 20)]
 fn clip_small(bencher: divan::Bencher<'_, '_>) {
-    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/synthetic_30fps.mp4");
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../tests/data/synthetic_30fps.mp4");
     clip(bencher, &path, DecoderChoice::Embedded, 64);
 }
 
