@@ -348,3 +348,77 @@ fn jpeg_pictures_are_read() {
     assert_eq!((image.width, image.height), (24, 16));
     assert!(image.data.iter().any(|v| *v > 200) && image.data.iter().any(|v| *v < 60));
 }
+
+/// Stretches that follow each other are read by one decoder that stands between them; whatever the order in which they are asked
+/// for, and by how many threads, each has the pixels that a video opened for it alone gives.
+#[test]
+fn reading_on_gives_the_pixels_of_starting_again() {
+    for name in [
+        "synthetic_30fps.mp4",
+        "synthetic_fragmented.mp4",
+        "synthetic_variable.mp4",
+    ] {
+        let path = own(name);
+        let decoders = [DecoderChoice::Embedded, DecoderChoice::Ffmpeg];
+        for decoder in decoders
+            .into_iter()
+            .take(1 + usize::from(ffmpeg::available()))
+        {
+            let settings = VideoSettings::by(decoder);
+            let open = || Video::open_with(&path, &settings).unwrap();
+            let read = |video: &Video, frames: &[usize]| -> Vec<u32> {
+                let chosen = video.chosen(frames.to_vec()).unwrap();
+                chosen
+                    .map(|frame| crc32(&[&frame.unwrap().image.data]))
+                    .collect()
+            };
+            let count = open().info().frames;
+            let stretches: Vec<Vec<usize>> = [
+                (0, 9, 1),
+                (9, 17, 2),
+                (17, 25, 1),
+                (20, 30, 3),
+                (3, 12, 2),
+                (12, 31, 5),
+            ]
+            .into_iter()
+            .map(|(from, to, step)| (from..to).step_by(step).filter(|f| *f < count).collect())
+            .collect();
+            let alone: Vec<Vec<u32>> = stretches.iter().map(|s| read(&open(), s)).collect();
+            let video = open();
+            // Every start of `ffmpeg` takes its time.
+            let turns = if decoder == DecoderChoice::Ffmpeg {
+                1
+            } else {
+                3
+            };
+            for turn in 0..turns {
+                for (stretch, alone) in stretches.iter().zip(&alone) {
+                    assert!(
+                        read(&video, stretch) == *alone,
+                        "{name}, {decoder:?}, turn {turn}, {stretch:?}"
+                    );
+                }
+            }
+            // Left in the middle, a reader leaves its decoder there.
+            let mut some = video.chosen(stretches[0].clone()).unwrap();
+            some.next();
+            drop(some);
+            assert!(
+                read(&video, &stretches[1]) == alone[1],
+                "{name}, {decoder:?}"
+            );
+            std::thread::scope(|scope| {
+                for shift in 0..turns {
+                    let (video, stretches, alone) = (&video, &stretches, &alone);
+                    scope.spawn(move || {
+                        for at in 0..stretches.len() {
+                            let at = (at + 2 * shift) % stretches.len();
+                            assert!(read(video, &stretches[at]) == alone[at]);
+                        }
+                    });
+                }
+            });
+        }
+    }
+}

@@ -2,14 +2,18 @@
 //! picture to the last one that is needed, put into the order of presentation. Pictures that nothing refers to are passed over
 //! where they are not asked for, and no more than a handful is ever held.
 
+mod standing;
+
 use super::choice::FrameTimes;
 use super::colour::ColourSpace;
 use super::h264::{Configuration, PictureError, Pictures};
 use super::mp4::{Sample, Track};
+use super::parked::Parked;
 use crate::formats::ReadError;
 use crate::formats::read_error::Position;
 use crate::video::image::Orientation;
 use rusty_h264_common::YuvFrame;
+use standing::Standing;
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
@@ -44,6 +48,8 @@ pub struct Index {
     rank: Vec<u32>,
     /// Position in `order` of every frame, in order of presentation.
     shown: Vec<u32>,
+    /// Decoders that stand in the middle of the file.
+    parked: Arc<Parked<Standing>>,
 }
 
 impl Index {
@@ -124,6 +130,7 @@ impl Index {
             samples: track.samples,
             order,
             rank,
+            parked: Arc::default(),
         };
         Ok(match index.trial()? {
             Some(what) => Err(format!("H.264 with `{what}`")),
@@ -309,6 +316,8 @@ pub struct Wanted {
     first_rank: u32,
     pending: BTreeMap<u32, (YuvFrame, ColourSpace)>,
     sample: Vec<u8>,
+    /// Something was wrong: what the decoder holds is not to be believed.
+    failed: bool,
 }
 
 impl Wanted {
@@ -339,6 +348,7 @@ impl Wanted {
             first_rank: 0,
             pending: BTreeMap::new(),
             sample: Vec::new(),
+            failed: false,
         })
     }
 
@@ -347,18 +357,27 @@ impl Wanted {
         let Some(part) = self.parts.pop() else {
             return 0..0;
         };
-        if part.start != self.next {
-            self.pictures.restart();
-        }
-        self.next = part.start;
-        self.first_rank = match part.start {
-            0 => 0,
-            start => self.index.rank[start],
-        };
-        self.pending.clear();
-        self.delivered = 0;
         let shown = &self.index.shown;
         self.ranks = part.frames.iter().map(|&k| (shown[k], k)).collect();
+        match self.standing(part.start) {
+            Some(standing) => {
+                self.pictures = standing.pictures;
+                self.next = standing.next;
+                self.first_rank = standing.first_rank;
+            }
+            None => {
+                if part.start != self.next {
+                    self.pictures.restart();
+                }
+                self.next = part.start;
+                self.first_rank = match part.start {
+                    0 => 0,
+                    start => self.index.rank[start],
+                };
+            }
+        }
+        self.pending.clear();
+        self.delivered = 0;
         0..self.ranks.len()
     }
 
@@ -450,6 +469,7 @@ impl Iterator for Wanted {
     fn next(&mut self) -> Option<Self::Item> {
         let result = self.advance().transpose();
         if matches!(result, Some(Err(_))) {
+            self.failed = true;
             self.parts.clear();
             self.ranks.clear();
             self.delivered = 0;

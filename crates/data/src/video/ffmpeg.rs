@@ -10,11 +10,12 @@
 mod process;
 
 use super::choice::FrameTimes;
+use super::parked::Parked;
 use crate::formats::ReadError;
 use crate::video::image::Image;
 use process::{Reader, Source, Stamp};
 use std::path::Path;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 
 pub use process::available;
 
@@ -40,8 +41,8 @@ pub struct Index {
     stamps: Arc<Vec<i64>>,
     /// Frames at which decoding can start, ascending; none where the file has to be read from its start.
     keys: Option<Arc<Vec<usize>>>,
-    /// Processes that stand in the middle of a file which can only be read from its start.
-    parked: Arc<Mutex<Vec<Reader>>>,
+    /// Processes that stand in the middle of the file.
+    parked: Arc<Parked<Reader>>,
     /// Upright, as decoded.
     pub size: [u32; 2],
     /// Width to height of a pixel of the upright picture.
@@ -113,15 +114,17 @@ impl Index {
 
     /// A process that has yet to hand over `frame`.
     fn reader(&self, frame: usize) -> Result<Reader, ReadError> {
+        let key = self.key(frame, 0);
+        let standing = self.parked.take(|reader| {
+            let (position, sequential) = (reader.position, self.keys.is_none());
+            let near = sequential || key <= position + TRIAL;
+            (position <= frame && near).then_some(position)
+        });
+        if let Some(reader) = standing {
+            return Ok(reader);
+        }
         if self.keys.is_none() {
-            let mut parked = self.parked.lock().unwrap_or_else(PoisonError::into_inner);
-            let best = (0..parked.len())
-                .filter(|&at| parked[at].position <= frame)
-                .max_by_key(|&at| parked[at].position);
-            return match best {
-                Some(at) => Ok(parked.swap_remove(at)),
-                None => self.source.read(false, None),
-            };
+            return self.source.read(false, None);
         }
         for earlier in 0..=EARLIER {
             let key = self.key(frame, earlier);
@@ -241,22 +244,9 @@ impl Drop for Wanted {
         let Some(reader) = self.reader.take() else {
             return;
         };
-        if self.index.keys.is_some() || reader.position >= self.index.stamps.len() {
-            return;
-        }
         // Whoever reads on in this file need not start again.
-        let most = std::thread::available_parallelism().map_or(2, usize::from);
-        let mut parked = self
-            .index
-            .parked
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner);
-        parked.push(reader);
-        if parked.len() > most {
-            let first = (0..parked.len()).min_by_key(|&at| parked[at].position);
-            if let Some(first) = first {
-                parked.swap_remove(first);
-            }
+        if reader.position < self.index.stamps.len() {
+            self.index.parked.park(reader);
         }
     }
 }

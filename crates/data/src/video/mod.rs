@@ -16,6 +16,7 @@ pub mod h264;
 pub mod image;
 pub mod mp4;
 mod parallel;
+mod parked;
 mod resize;
 
 pub use choice::FrameTimes;
