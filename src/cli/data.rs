@@ -5,6 +5,7 @@ mod inspect;
 mod label_depth;
 mod status;
 mod synthesize;
+mod tokenize;
 mod verify;
 
 use super::run::{interruptible, progress};
@@ -42,6 +43,7 @@ enum Command {
     Convert(convert::Convert),
     LabelDepth(label_depth::LabelDepth),
     Synthesize(synthesize::Synthesize),
+    Tokenize(tokenize::Tokenize),
     Verify(verify::Verify),
 }
 
@@ -53,6 +55,7 @@ impl super::Run for Data {
             Command::Convert(command) => command.run(terminal),
             Command::LabelDepth(command) => command.run(terminal),
             Command::Synthesize(command) => command.run(terminal),
+            Command::Tokenize(command) => command.run(terminal),
             Command::Verify(command) => command.run(terminal),
         }
     }

@@ -115,6 +115,20 @@ fn render(plan: &Planned) -> String {
     if plan.flop() > 0.0 {
         totals.push(format!("{} FLOP", scaled(plan.flop())));
     }
+    if let Some(data) = plan.data() {
+        let mut parts = Vec::new();
+        if data.clips > 0 {
+            parts.push(format!("{} clips", grouped(data.clips)));
+        }
+        if data.tokens > 0 {
+            parts.push(format!("at most {} tokens", scaled(data.tokens as f64)));
+        }
+        parts.push(format!("{} on disk", bytes(data.bytes)));
+        if data.core_hours > 0.0 {
+            parts.push(format!("about {} core hours", rough(data.core_hours)));
+        }
+        let _ = writeln!(text, "\ndata to do: {}", parts.join(", "));
+    }
     if let Some(memory) = plan.memory() {
         totals.push(format!("peak memory {}", bytes(memory)));
     }
@@ -232,6 +246,15 @@ fn scaled(number: f64) -> String {
         || format!("{number:.0}"),
         |(size, unit)| format!("{:.1} {unit}", number / size),
     )
+}
+
+/// Two digits of a number that is not known better.
+fn rough(number: f64) -> String {
+    if number < 10.0 {
+        return format!("{number:.1}");
+    }
+    let scale = 10f64.powf(number.log10().floor() - 1.0);
+    grouped(((number / scale).round() * scale) as u64)
 }
 
 /// `1.2 GiB`.

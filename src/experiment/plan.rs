@@ -1,6 +1,6 @@
 //! What running an experiment would do: every different stage once, what its cells share, what is cached already.
 
-use super::artifact::{ArtifactKind, Description};
+use super::artifact::{ArtifactKind, Description, TokenFacts};
 use super::graph::{ArtifactKey, Experiment, Graph, Stage};
 use super::stage::StagePlan;
 use serde::Serialize;
@@ -17,6 +17,19 @@ pub struct Plan {
     pub stages: Vec<PlannedStage>,
     /// Stages of all cells together; the difference to `stages` is what they share.
     pub total: usize,
+}
+
+/// The clips and tokens of all stages that are to do.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize)]
+pub struct DataToDo {
+    /// At most so many: recordings may give fewer.
+    pub clips: u64,
+    /// At most so many: no clip has every modality.
+    pub tokens: u64,
+    /// On disk, clips and tokens.
+    pub bytes: u64,
+    /// Of one processor core, by what was measured on one machine: an order of magnitude.
+    pub core_hours: f64,
 }
 
 /// One piece of work.
@@ -49,6 +62,26 @@ impl Plan {
     /// The largest peak memory of what is to do, in bytes.
     pub fn memory(&self) -> Option<u64> {
         self.to_do().filter_map(|stage| stage.plan.memory).max()
+    }
+
+    /// What there is to do with data: converting clips and tokenizing them. None where nothing of it is.
+    #[must_use]
+    pub fn data(&self) -> Option<DataToDo> {
+        let mut sum = DataToDo::default();
+        for stage in self.to_do() {
+            let clips: u64 = stage.description.clips.values().sum();
+            match stage.makes {
+                ArtifactKind::Clips => sum.clips += clips,
+                ArtifactKind::Tokens => {
+                    let each = stage.description.tokens.values();
+                    sum.tokens += clips * each.map(TokenFacts::count).sum::<u64>();
+                }
+                _ => continue,
+            }
+            sum.bytes += stage.plan.disk.unwrap_or_default();
+            sum.core_hours += stage.plan.core_seconds.unwrap_or_default() / 3600.0;
+        }
+        (sum.clips + sum.tokens > 0).then_some(sum)
     }
 
     /// Seconds of what is to do, where every stage knows its own.

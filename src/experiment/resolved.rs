@@ -39,7 +39,11 @@ fn stage_to_yaml(experiment: &Experiment, cell: &Cell, stage: &Stage) -> String 
             .map(|&index| scalar(&cell.graph.stages[index].name))
             .collect();
         let port = stage.op.inputs().iter().find(|port| port.name == edge.port);
-        let many = port.is_some_and(|port| matches!(port.arity, Arity::Many | Arity::Any));
+        let many = port.is_some_and(|port| match port.arity {
+            Arity::Many | Arity::Any => true,
+            Arity::OneOrMore => names.len() > 1,
+            Arity::One | Arity::Optional => false,
+        });
         let value = if many {
             format!("[{}]", names.join(", "))
         } else {

@@ -208,6 +208,10 @@ impl Editor<'_> {
                         Arity::Many | Arity::Any => json!({
                             "type": "array", "items": {"type": "string"}, "description": about,
                         }),
+                        Arity::OneOrMore => json!({
+                            "anyOf": [{"type": "string"}, {"type": "array", "items": {"type": "string"}}],
+                            "description": about,
+                        }),
                         Arity::One => json!({ "type": "string", "description": about }),
                         Arity::Optional => {
                             json!({ "type": ["string", "null"], "description": about })

@@ -22,6 +22,8 @@ pub enum Arity {
     Optional,
     /// A list of at least one: `tokenizers: [tok_body, tok_camera]`.
     Many,
+    /// One, or a list of at least one: `clips: nymeria` or `clips: [nymeria, egoexo]`.
+    OneOrMore,
     /// A list that may be empty or absent.
     Any,
 }
@@ -113,6 +115,8 @@ pub struct StagePlan {
     pub flop: Option<f64>,
     /// Seconds, where a throughput has been measured on this machine.
     pub seconds: Option<f64>,
+    /// Seconds of one processor core for work on data, by what was measured on one machine: an order of magnitude.
+    pub core_seconds: Option<f64>,
     /// Anything worth a line.
     pub lines: Vec<String>,
 }

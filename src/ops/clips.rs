@@ -151,6 +151,7 @@ impl Op for Clips {
                 .collect(),
             work: Some((clips, "clips".to_owned())),
             disk: Some(clips * settings.clip_bytes()),
+            core_seconds: settings.core_seconds().map(|each| each * clips as f64),
             memory: Some(settings.clip_bytes() * 4 * rayon::current_num_threads() as u64),
             ..StagePlan::default()
         }

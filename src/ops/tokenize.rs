@@ -7,26 +7,29 @@
 
 use super::clip_signals::{SPLITS, damaged, format, modality, open_split};
 use super::device::compute;
-use crate::clip::shard::{ShardError, ShardWriter, TOKENS_PER_SHARD};
-use crate::clip::store::{ClipSet, tokens_to_bytes};
+use crate::clip::shard::{ShardWriter, TOKENS_PER_SHARD};
+use crate::clip::store::ClipSet;
+use crate::datasets::shards::tars;
 use crate::engine::{DeviceChoice, Precision};
 use crate::experiment::{
     Arity, ArtifactKind, Code, Description, Inputs, Op, OpEntry, Port, Problem, StageContext,
     StageError, StagePlan, TokenFacts, TokenPlan,
 };
-use crate::formats::npz::Npz;
+use crate::flow::Flow;
+use crate::formats::ReadError;
 use crate::masking::PIXELS;
-use crate::modality::Modality;
-use crate::tokenizer::{self, Tokenizer};
-use crate::training::signals::extract;
+use crate::modality::ClipFormat;
+use crate::tokenizer;
+use crate::training::TrainingError;
+use crate::training::token_folder::{ModalityTokens, TokenHeader, write_shard};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-/// Clips tokenized at a time.
-const CHUNK: usize = 16;
+/// Where the description of a tokenizer says how many seconds of one core a clip takes it.
+pub(super) const ENCODE_SECONDS: &str = "encode_core_seconds";
 /// The folder of the checkpoints where shards lie until all are finished.
 const SHARDS: &str = "tokens";
 /// The folder of the checkpoints with an empty file for every finished shard, `{split}-{number}`.
@@ -53,6 +56,9 @@ pub struct TokenizeSettings {
     pub pixels: RawVideo,
     /// Where the tokenizers run.
     pub device: DeviceChoice,
+    /// The folder of `data.yaml` with the shards that `reviv data tokenize` made of the same clips with the same tokenizers: they are
+    /// taken instead of made again.
+    pub made: Option<String>,
 }
 
 impl TokenizeSettings {
@@ -104,6 +110,11 @@ impl Op for Tokenize {
 
     fn seeded(&self) -> bool {
         false
+    }
+
+    fn data(&self, settings: &TokenizeSettings) -> Vec<(String, String)> {
+        let made = settings.made.clone().into_iter();
+        made.map(|name| (name, "made".to_owned())).collect()
     }
 
     fn check(
@@ -205,6 +216,12 @@ impl Op for Tokenize {
                 .collect(),
             work: Some((clips, "clips".to_owned())),
             disk: Some(clips * (member + pixels)),
+            core_seconds: inputs
+                .all("tokenizers")
+                .iter()
+                .map(|input| input.description.extra.get(ENCODE_SECONDS)?.as_f64())
+                .sum::<Option<f64>>()
+                .map(|each| each * clips as f64),
             ..StagePlan::default()
         }
     }
@@ -240,7 +257,7 @@ impl Op for Tokenize {
             tokens.insert(name.clone(), facts);
             let place = context.output().join("tokenizers").join(name);
             deliver(&artifact.path, &place, false)?;
-            writers.push(Writer {
+            writers.push(ModalityTokens {
                 modality,
                 tokenizer,
             });
@@ -251,11 +268,24 @@ impl Op for Tokenize {
                 sets.push((split, set));
             }
         }
+        let pixels = settings.pixels == RawVideo::Rgb;
+        let splits = sets.iter();
+        let splits = splits.map(|(split, set)| ((*split).to_owned(), json!({"clips": set.len()})));
+        let splits: serde_json::Map<_, _> = splits.collect();
+        let mut contents = json!({ "tokens": tokens, "splits": splits, "format": format });
+        if pixels {
+            contents[PIXELS] = json!([format.frames, format.size, format.size, 3]);
+        }
+        if let Some(name) = &settings.made {
+            let root = context.data_root(name).map(Path::to_owned);
+            let root = root.ok_or_else(|| damaged(&format!("`{name}` is not in `data.yaml`")))?;
+            take_made(&root, &format, &writers, pixels, &sets, context.output())?;
+            return Ok(contents);
+        }
         let total: usize = sets.iter().map(|(_, set)| set.len()).sum();
         let markers = context.checkpoints().join(MARKERS);
         std::fs::create_dir_all(&markers).map_err(StageError::io(&markers))?;
         let mut done = 0;
-        let mut splits = serde_json::Map::new();
         for (split, set) in &sets {
             let folder = context.checkpoints().join(SHARDS).join(split);
             std::fs::create_dir_all(&folder).map_err(StageError::io(&folder))?;
@@ -264,91 +294,86 @@ impl Op for Tokenize {
                 let number = (start / TOKENS_PER_SHARD) as u32;
                 let marker = markers.join(format!("{split}-{number:06}"));
                 if !marker.exists() {
-                    let mut shard = ShardWriter::new(&folder, number);
-                    for from in (start..end).step_by(CHUNK) {
-                        if context.interrupted() {
-                            return Err(StageError::Interrupted);
-                        }
-                        let to = (from + CHUNK).min(end);
-                        for writer in &writers {
-                            writer.add(set, from..to, &mut shard)?;
-                        }
-                        if settings.pixels == RawVideo::Rgb {
-                            add_pixels(set, from..to, &mut shard)?;
-                        }
-                        context.progress((done + to - start) as u64, total as u64, "clips");
+                    let shard = ShardWriter::new(&folder, number);
+                    let mut watch = |clips: usize| {
+                        context.progress((done + clips) as u64, total as u64, "clips");
+                        let stop = context.interrupted();
+                        Ok::<_, TrainingError>(if stop { Flow::Stop } else { Flow::Continue })
+                    };
+                    if !write_shard(&writers, pixels, set, start..end, shard, &mut watch)
+                        .map_err(unusable)?
+                    {
+                        return Err(StageError::Interrupted);
                     }
-                    shard.finish().map_err(StageError::other)?;
                     std::fs::write(&marker, b"").map_err(StageError::io(&marker))?;
                 }
                 done += end - start;
                 context.progress(done as u64, total as u64, "clips");
             }
-            splits.insert((*split).to_owned(), json!({ "clips": set.len() }));
         }
         let names: Vec<&str> = sets.iter().map(|(split, _)| *split).collect();
         deliver_splits(context.checkpoints(), &names, context.output())?;
-        let mut contents = json!({ "tokens": tokens, "splits": splits, "format": format });
-        if settings.pixels == RawVideo::Rgb {
-            contents[PIXELS] = json!([format.frames, format.size, format.size, 3]);
-        }
         Ok(contents)
     }
 }
 
-/// One modality's way into the shards.
-struct Writer {
-    modality: Box<dyn Modality>,
-    tokenizer: Box<dyn Tokenizer>,
-}
-
-impl Writer {
-    fn add(
-        &self,
-        set: &ClipSet,
-        range: std::ops::Range<usize>,
-        shard: &mut ShardWriter,
-    ) -> Result<(), StageError> {
-        let found = extract(set, self.modality.as_ref(), &[], range)
-            .map_err(|error| damaged(&error.to_string()))?;
-        let (clips, signals): (Vec<_>, Vec<_>) = found
-            .into_iter()
-            .map(|found| (found.clip.id, found.signal))
-            .unzip();
-        let grids = self
-            .tokenizer
-            .encode(&signals)
-            .map_err(|error| damaged(&error.to_string()))?;
-        for (id, grid) in clips.iter().zip(grids) {
-            let bytes = tokens_to_bytes(&grid.ids, &grid.grid).map_err(StageError::other)?;
-            shard
-                .add(self.modality.name(), id, &bytes)
-                .map_err(StageError::other)?;
-        }
-        Ok(())
-    }
-}
-
-fn add_pixels(
-    set: &ClipSet,
-    range: std::ops::Range<usize>,
-    shard: &mut ShardWriter,
+/// Takes the shards of a folder that `reviv data tokenize` made, where they are those that would be made here.
+fn take_made(
+    root: &Path,
+    format: &ClipFormat,
+    modalities: &[ModalityTokens],
+    pixels: bool,
+    sets: &[(&str, ClipSet)],
+    output: &Path,
 ) -> Result<(), StageError> {
-    for index in range {
-        let clip = set
-            .clip_with(index, &["rgb"])
-            .map_err(|error: ShardError| damaged(&error.to_string()))?;
-        if let Some(rgb) = clip.rgb() {
-            let bytes = Npz::default()
-                .with("arr_0", &rgb.frames)
-                .to_bytes()
-                .map_err(StageError::other)?;
-            shard
-                .add(PIXELS, &clip.id, &bytes)
-                .map_err(StageError::other)?;
+    let refused = |message: String, help: &str| StageError::Input {
+        code: Code::E0601,
+        message: format!("{}: {message}", root.display()),
+        help: help.to_owned(),
+    };
+    let found = TokenHeader::read(root).map_err(|error| {
+        let help = "`reviv data tokenize` makes such a folder";
+        refused(error.to_string(), help)
+    })?;
+    let names = sets.iter();
+    let names = names.map(|(split, set)| ((*split).to_owned(), set.ids()));
+    let per_shard = found.clips_per_shard;
+    let own = TokenHeader::of(format, modalities, pixels, &names.collect(), per_shard)
+        .map_err(unusable)?;
+    if let Some(difference) = found.difference(&own) {
+        let help = "make the tokens again of these clips with these tokenizers";
+        return Err(refused(difference, help));
+    }
+    let missing = found.missing(root);
+    if missing > 0 {
+        let total = found.shards().count();
+        let message = format!("{missing} of {total} shards are not finished");
+        return Err(refused(message, "`reviv data verify` says which"));
+    }
+    for (split, _) in sets {
+        let from = root.join(split);
+        for file in tars(&from).map_err(|error| unusable(error.into()))? {
+            let (file, target) = (from.join(&file), output.join(split).join(&file));
+            let folder = target.parent().unwrap_or(output);
+            std::fs::create_dir_all(folder).map_err(StageError::io(folder))?;
+            // Finished shards are never written again, so that one copy on a disk will do.
+            if std::fs::hard_link(&file, &target).is_err() {
+                std::fs::copy(&file, &target).map_err(StageError::io(&file))?;
+            }
         }
     }
     Ok(())
+}
+
+/// What is wrong with clips and tokenizers is for the user to mend, what is wrong with the disk is not.
+fn unusable(error: TrainingError) -> StageError {
+    match error {
+        TrainingError::Clips(ReadError::Io { path, cause }) => StageError::Io {
+            path: path.display().to_string(),
+            error: cause,
+        },
+        error => damaged(&error.to_string()),
+    }
 }
 
 /// Moves the finished shards of every split to where the artifact is written.

@@ -270,6 +270,7 @@ impl Op for TrainMget {
             // Backward costs twice the forward; a multiply-accumulate is two operations.
             flop: Some(6.0 * forward * samples as f64),
             seconds: None,
+            core_seconds: None,
             lines: vec![
                 format!(
                     "{:.0}% of nominal tokens are real: {:.0} of {} visible, {:.0} of {} asked for per sample",

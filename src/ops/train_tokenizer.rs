@@ -10,10 +10,11 @@ mod run;
 
 use super::clip_signals::{described_format, modality, unknown_modality};
 use super::modality_entry::{DEFAULTS, read_defaults};
+use super::tokenize::ENCODE_SECONDS;
 use super::tokenizer_entry::TokenizerEntry;
 use crate::engine::{Compute, DeviceChoice, Initialise, Parameters};
 use crate::experiment::{
-    Arity, ArtifactKind, Code, Description, Entry, Inputs, Op, OpEntry, Port, Problem,
+    Arity, ArtifactKind, Code, Description, Entry, InputFacts, Inputs, Op, OpEntry, Port, Problem,
     StageContext, StageError, StagePlan, TokenFacts, TokenPlan,
 };
 use crate::modality::Shape;
@@ -34,6 +35,8 @@ pub struct TrainTokenizerSettings {
     pub modality: String,
     /// Family and sizes; absent: what the entry of a declared modality names.
     pub tokenizer: Option<Entry<TokenizerEntry>>,
+    /// How often each data set of `clips` is drawn; empty means in proportion to its signals, those of mirrored hands counted.
+    pub weights: Vec<f64>,
     /// Optimizer steps.
     #[schemars(range(min = 1))]
     pub steps: u64,
@@ -74,6 +77,7 @@ impl Default for TrainTokenizerSettings {
         Self {
             modality: String::new(),
             tokenizer: None,
+            weights: Vec::new(),
             steps: training.steps,
             batch: training.batch,
             micro_batch: training.micro_batch,
@@ -157,8 +161,8 @@ impl Op for TrainTokenizer {
         &[Port {
             name: "clips",
             kinds: &[ArtifactKind::Clips],
-            arity: Arity::One,
-            about: "clips to train on (`train`) and to score on (`validation`)",
+            arity: Arity::OneOrMore,
+            about: "clips to train on (`train`) and to score on (`validation`), of one data set or of several, drawn by `weights`",
         }]
     }
 
@@ -194,7 +198,14 @@ impl Op for TrainTokenizer {
             ));
             return Description::default();
         };
-        let signals = clips.clips.get("train").copied().unwrap_or_default();
+        let all = inputs.all("clips");
+        for (index, facts) in all.iter().enumerate().skip(1) {
+            problems.extend(differs(&settings.modality, clips, facts, index));
+        }
+        if let Some(reason) = wrong_weights(&settings.weights, all.len()) {
+            problems.push(Problem::new(Code::E0206, "weights", reason));
+        }
+        let signals = clips_of(all, "train");
         match settings.warmup_steps(signals) {
             Some(warmup) if warmup > settings.steps => {
                 let message = format!("{warmup} warm-up steps in a run of {}", settings.steps);
@@ -215,15 +226,17 @@ impl Op for TrainTokenizer {
             let message = format!("`{place}` is out of its range");
             problems.push(Problem::new(Code::E0206, place, message));
         }
-        if clips.clips.get("train").is_none_or(|count| *count == 0) {
-            let problem = Problem::new(Code::E0401, "clips", "the clips have no `train` split");
-            problems.push(problem.help("give the clips stage `train:` a number"));
+        for facts in all {
+            if facts.description.clips.get("train").is_none_or(|n| *n == 0) {
+                let message = match all {
+                    [_] => "the clips have no `train` split".to_owned(),
+                    _ => format!("the clips of `{}` have no `train` split", facts.stage),
+                };
+                let problem = Problem::new(Code::E0401, "clips", message);
+                problems.push(problem.help("give the clips stage `train:` a number"));
+            }
         }
-        if clips
-            .clips
-            .get("validation")
-            .is_none_or(|count| *count == 0)
-        {
+        if clips_of(all, "validation") == 0 {
             let problem = Problem::new(Code::W0701, "clips", "no held-out clips to score on");
             problems.push(problem.help("give the clips stage `validation:` a number"));
         }
@@ -239,9 +252,16 @@ impl Op for TrainTokenizer {
         };
         match tokens(&entry.settings, &modality.shape()) {
             Ok(tokens) => Description {
+                extra: [
+                    ("tokenizer".to_owned(), json!(entry.name)),
+                    (
+                        ENCODE_SECONDS.to_owned(),
+                        json!(encode_seconds(&entry.settings, &modality.shape(), &tokens)),
+                    ),
+                ]
+                .into(),
                 tokens: [(settings.modality.clone(), tokens)].into(),
                 signals: [(settings.modality.clone(), facts.clone())].into(),
-                extra: [("tokenizer".to_owned(), json!(entry.name))].into(),
                 ..Description::default()
             },
             Err(message) => {
@@ -318,6 +338,50 @@ impl Op for TrainTokenizer {
     }
 }
 
+/// The clips of one split, of all data sets.
+fn clips_of(sets: &[InputFacts<'_>], split: &str) -> u64 {
+    let clips = |facts: &InputFacts<'_>| facts.description.clips.get(split).copied();
+    sets.iter().filter_map(clips).sum()
+}
+
+/// Why a further data set cannot be mixed with the first one, if it cannot.
+fn differs(
+    modality: &str,
+    first: &Description,
+    facts: &InputFacts<'_>,
+    index: usize,
+) -> Option<Problem> {
+    let key = format!("clips.{index}");
+    let Some(own) = facts.description.signals.get(modality) else {
+        return Some(unknown_modality(key, modality, facts.description));
+    };
+    // A pseudo-colour of depth means other metres where it is coded otherwise.
+    let coded = |clips: &Description| described_format(clips).map(|format| format.depth);
+    let known = first.signals.get(modality)?;
+    if own == known && (modality != "depth" || coded(first) == coded(facts.description)) {
+        return None;
+    }
+    let message = format!(
+        "`{}` has `{modality}` of another form than the first data set: {:?} at {} Hz, not {:?} at {} Hz",
+        facts.stage, own.shape, own.rate, known.shape, known.rate
+    );
+    let problem = Problem::new(Code::E0401, key, message);
+    Some(problem.help("give all clips the same `cut`, size and coding of depth"))
+}
+
+/// Why `sets` data sets cannot be drawn by `weights`, if they cannot.
+fn wrong_weights(weights: &[f64], sets: usize) -> Option<String> {
+    if weights.is_empty() {
+        return None;
+    }
+    if weights.len() != sets {
+        return Some(format!("{} weights for {sets} data sets", weights.len()));
+    }
+    let usable = weights.iter().all(|w| w.is_finite() && *w >= 0.0);
+    (!usable || weights.iter().sum::<f64>() <= 0.0)
+        .then(|| format!("weights of {weights:?} are no shares: they must be positive"))
+}
+
 fn names<'a>(names: impl Iterator<Item = &'a String>) -> String {
     names.map(String::as_str).collect::<Vec<_>>().join(", ")
 }
@@ -357,6 +421,29 @@ fn tokens(entry: &TokenizerEntry, shape: &Shape) -> Result<TokenFacts, String> {
     }
 }
 
+/// Seconds of one core to make the tokens of a clip, an order of magnitude: products at 90 GFLOP/s for the encoder, which is half
+/// of a VQ-VAE; a video tokenizer by its pixels and the square of its width beside Cosmos DV4x8x8 (benches/results.md).
+fn encode_seconds(entry: &TokenizerEntry, shape: &Shape, tokens: &TokenFacts) -> Option<f64> {
+    match (entry, shape) {
+        (TokenizerEntry::Vq(_), _) => {
+            let parameters = parameters(entry, shape)?;
+            Some(parameters as f64 * tokens.count() as f64 / 90e9)
+        }
+        (
+            TokenizerEntry::Video(settings),
+            Shape::Video {
+                frames,
+                height,
+                width,
+            },
+        ) => {
+            let pixels = (frames * height * width) as f64 / (17.0 * 256.0 * 256.0);
+            Some(4.3 * pixels * (settings.channels as f64 / 128.0).powi(2))
+        }
+        _ => None,
+    }
+}
+
 /// How many trainable numbers the tokenizer has; nothing is allocated.
 fn parameters(entry: &TokenizerEntry, shape: &Shape) -> Option<u64> {
     let compute = Compute::cpu();
@@ -371,7 +458,7 @@ fn parameters(entry: &TokenizerEntry, shape: &Shape) -> Option<u64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::experiment::{InputFacts, SignalFacts};
+    use crate::experiment::SignalFacts;
     use crate::modality::ClipFormat;
 
     fn clips() -> Description {

@@ -3,7 +3,7 @@
 //! Read in this order: [`settings`], [`source`] (where tokens come from), [`sampler`] (which clip stands where), [`loader`]
 //! (batches prepared ahead), [`trainer`] (**one step, and the state between steps**), [`mod@fit`] (the loop), [`validation`],
 //! [`optimizer`], [`schedule`]. Trained are [`mget`] and [`tokenizer`]s; [`kmeans`] is what the latter have to beat. [`mget_fit`] and
-//! [`tokenizer_fit`] are the way from clips to a model.
+//! [`tokenizer_fit`] are the way from clips to a model; a [`mixture`] is what a tokenizer learns from.
 //!
 //! Data order, masks and initial weights are functions of the seed and the step, so a run that was killed and resumed has the
 //! same bytes as one that was not.
@@ -13,6 +13,7 @@ pub mod kmeans;
 pub mod loader;
 pub mod mget;
 pub mod mget_fit;
+pub mod mixture;
 pub mod optimizer;
 pub mod sampler;
 pub mod schedule;
@@ -20,6 +21,7 @@ pub mod settings;
 pub mod shards;
 pub mod signals;
 pub mod source;
+pub mod token_folder;
 pub mod tokenizer;
 mod tokenizer_errors;
 pub mod tokenizer_fit;
@@ -33,6 +35,7 @@ pub use fit::{Callback, Checkpoint, Event, Intervals, fit};
 pub use loader::{BatchSource, Loader};
 pub use mget::MaskedPrediction;
 pub use mget_fit::{FittedMget, MgetFit, TrainOptions};
+pub use mixture::Mixture;
 pub use optimizer::{AdamW, AdamWSettings};
 pub use sampler::Sampler;
 pub use schedule::Schedule;

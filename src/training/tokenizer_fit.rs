@@ -2,6 +2,7 @@
 
 use super::fit::{Callback, Intervals, fit, progress};
 use super::kmeans::KMeans;
+use super::mixture::Mixture;
 use super::signals::extract;
 use super::tokenizer::{Epochs, TokenizerTraining, mirrored};
 use super::tokenizer_scores::{Baselines, Example, Scores, score};
@@ -40,6 +41,8 @@ pub struct TokenizerFit<'a> {
     pub format: &'a ClipFormat,
     /// What it learns from.
     pub train: &'a dyn ClipSource,
+    /// The data sets of which `train` is made.
+    pub mixture: Mixture<'a>,
     /// What it is scored on.
     pub held_out: Option<&'a dyn ClipSource>,
     /// At most so many of them.
@@ -122,7 +125,7 @@ impl TokenizerFit<'_> {
         let shape = modality.shape();
         let init = Initialise::new(self.compute, self.seed);
         let mut model = VqVae::new(&init, sizes, &shape).map_err(TrainingError::from)?;
-        let signals = self.signals(modality, callback)?;
+        let (signals, sets) = self.signals(modality, callback)?;
         let width = model.patches().values_per_sample();
         let normaliser = self
             .normaliser(&signals, width)
@@ -145,7 +148,8 @@ impl TokenizerFit<'_> {
         }
         let mut trainer = Trainer::vq(model, &self.training, self.seed)?;
         self.resume(&mut trainer)?;
-        let mut epochs = Epochs::of(&trainer, self.seed);
+        let epochs = Epochs::of(&trainer, self.seed);
+        let mut epochs = self.mixture.epochs(epochs, &sets)?;
         let best = fit(
             &mut trainer,
             self.intervals,
@@ -207,9 +211,13 @@ impl TokenizerFit<'_> {
         let clip = [frames, height, width];
         let mut model = VideoTokenizer::new(self.modality, clip, network, self.compute)
             .map_err(TrainingError::from)?;
-        let having: Vec<usize> = (0..self.train.len())
-            .filter(|index| self.train.may_have(*index, self.modality))
-            .collect();
+        let mut having: Vec<usize> = Vec::new();
+        let mut sets = Vec::new();
+        for set in self.mixture.ranges(self.train.len()) {
+            let before = having.len();
+            having.extend(set.filter(|index| self.train.may_have(*index, self.modality)));
+            sets.push(having.len() - before);
+        }
         let one = |source: &dyn ClipSource, index: usize| {
             let found = extract(source, modality, &[], index..index + 1)?;
             Ok::<_, TrainingError>(found.into_iter().next().map(|found| found.signal))
@@ -225,7 +233,8 @@ impl TokenizerFit<'_> {
         let validation = self.validation();
         let mut trainer = Trainer::video(model, &self.training)?;
         self.resume(&mut trainer)?;
-        let mut epochs = Epochs::of(&trainer, self.seed);
+        let epochs = Epochs::of(&trainer, self.seed);
+        let mut epochs = self.mixture.epochs(epochs, &sets)?;
         let best = fit(
             &mut trainer,
             self.intervals,
@@ -293,31 +302,37 @@ impl TokenizerFit<'_> {
         Some((source, self.held_out_clips.min(source.len())))
     }
 
-    /// All training signals of the modality; for hands also those of the other hand in a mirror.
+    /// All training signals of the modality, for hands also those of the other hand in a mirror, and how many each data set has.
     fn signals<E: From<TrainingError>>(
         &self,
         modality: &dyn Modality,
         callback: &mut Callback<'_, E>,
-    ) -> Result<Vec<Signal>, E> {
+    ) -> Result<(Vec<Signal>, Vec<usize>), E> {
         let mut signals = Vec::new();
+        let mut sets = Vec::new();
         let other = self.mirror.and_then(|name| find(self.format, name).ok());
         let total = self.train.len();
-        for start in (0..total).step_by(CHUNK) {
-            progress(callback, start, total, "clips read")?;
-            let range = start..(start + CHUNK).min(total);
-            let own = extract(self.train, modality, &[], range.clone())?;
-            signals.extend(own.into_iter().map(|found| found.signal));
-            if let Some(other) = &other {
-                for found in &extract(self.train, other.as_ref(), &[], range)? {
-                    let signal = mirrored(&found.signal).map_err(|error| TrainingError::Clip {
-                        clip: found.clip.id.clone(),
-                        reason: error.to_string(),
-                    })?;
-                    signals.push(signal);
+        for set in self.mixture.ranges(total) {
+            let before = signals.len();
+            for start in set.clone().step_by(CHUNK) {
+                progress(callback, start, total, "clips read")?;
+                let range = start..(start + CHUNK).min(set.end);
+                let own = extract(self.train, modality, &[], range.clone())?;
+                signals.extend(own.into_iter().map(|found| found.signal));
+                if let Some(other) = &other {
+                    for found in &extract(self.train, other.as_ref(), &[], range)? {
+                        let signal =
+                            mirrored(&found.signal).map_err(|error| TrainingError::Clip {
+                                clip: found.clip.id.clone(),
+                                reason: error.to_string(),
+                            })?;
+                        signals.push(signal);
+                    }
                 }
             }
+            sets.push(signals.len() - before);
         }
-        Ok(signals)
+        Ok((signals, sets))
     }
 
     /// Statistics of the training signals, or the fixed ones where the reference has them: gaze becomes [-1, 1], and
@@ -450,6 +465,7 @@ impl Tokenizers {
                 modality: name,
                 format: &format,
                 train: clips,
+                mixture: Mixture::default(),
                 held_out: None,
                 held_out_clips: 0,
                 tokenizer: settings,

@@ -50,8 +50,8 @@ stages:
 ";
 
 /// Runs the experiment; gives every artifact by its op and modality.
-fn run(folder: &Path) -> Vec<(String, PathBuf, Value)> {
-    let outcome = run_text(folder, EXPERIMENT).unwrap_or_else(|report| panic!("{report}"));
+fn run(folder: &Path, experiment: &str) -> Vec<(String, PathBuf, Value)> {
+    let outcome = run_text(folder, experiment).unwrap_or_else(|report| panic!("{report}"));
     assert_eq!(outcome.state, State::Done, "{:?}", failures(&outcome));
     let mut artifacts = Vec::new();
     for leaf in Cache::of(&folder.join("runs")).entries().unwrap() {
@@ -70,7 +70,7 @@ fn run(folder: &Path) -> Vec<(String, PathBuf, Value)> {
 #[test]
 fn clips_become_tokens_that_the_model_reads_and_the_tokenizer_decodes() {
     let folder = tempfile::tempdir().unwrap();
-    let artifacts = run(folder.path());
+    let artifacts = run(folder.path(), EXPERIMENT);
     let of = |name: &str| {
         artifacts
             .iter()
@@ -145,4 +145,74 @@ fn clips_become_tokens_that_the_model_reads_and_the_tokenizer_decodes() {
         let signals = tokenizer.decode(std::slice::from_ref(&grid)).unwrap();
         assert_eq!(signals[0].values.shape(), [60, 9]);
     }
+}
+
+const MIXTURE: &str = "
+experiment: a_mixture
+about: Tokenizers of two data sets.
+stages:
+  large: {op: clips, source: {use: world_small, world: {size: 16, rooms: 3}}, train: 12, validation: 4}
+  small: {op: clips, source: {use: world_small, world: {size: 16, rooms: 2}}, train: 4, validation: 2}
+  tok_camera:
+    op: train_tokenizer
+    clips: [large, small]
+    modality: camera
+    tokenizer: {use: vq_temporal_small, codebook: 16, width: 16, depth: 1, heads: 2}
+    weights: [1, 3]
+    steps: 4
+    warmup: {steps: 0}
+    validate_every: 2
+    keep: best
+  tok_left_hand:
+    op: train_tokenizer
+    clips: [large, small]
+    modality: left_hand
+    tokenizer: {use: vq_kinematic_small, codebook: 16, width: 16, depth: 1, heads: 2}
+    steps: 4
+    batch: 4
+    warmup: {steps: 0}
+  tok_rgb:
+    op: train_tokenizer
+    clips: [large, small]
+    modality: rgb
+    tokenizer: {use: video_tiny, channels: 4}
+    weights: [0, 1]
+    steps: 2
+    batch: 2
+    warmup: {steps: 0}
+  tokens: {op: tokenize, clips: small, tokenizers: [tok_camera, tok_left_hand, tok_rgb]}
+";
+
+#[test]
+fn tokenizers_train_on_a_mixture_and_are_scored_on_all_of_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let artifacts = run(folder.path(), MIXTURE);
+    let contents = |op: &str| {
+        let found = artifacts.iter().find(|(name, _, _)| name == op);
+        found.unwrap_or_else(|| panic!("{op}")).2.clone()
+    };
+    assert_eq!(contents("train_tokenizer camera")["scores"]["clips"], 6);
+    assert_eq!(contents("train_tokenizer rgb")["scores"]["clips"], 6);
+    let hands = &contents("train_tokenizer left_hand")["scores"];
+    assert!(hands["reconstruction"]["mpjpe_mm"].as_f64().unwrap() > 0.0);
+}
+
+#[test]
+fn what_cannot_be_mixed_is_refused_where_it_is_written() {
+    let folder = tempfile::tempdir().unwrap();
+    let refused = |from: &str, to: &str| {
+        assert!(MIXTURE.contains(from));
+        run_text(folder.path(), &MIXTURE.replace(from, to)).unwrap_err()
+    };
+    let weights = refused("weights: [1, 3]", "weights: [1, 3, 1]");
+    assert!(weights.contains("3 weights for 2 data sets"), "{weights}");
+    let negative = refused("weights: [1, 3]", "weights: [1, -3]");
+    assert!(negative.contains("they must be positive"), "{negative}");
+    let sizes = refused("{size: 16, rooms: 2}", "{size: 24, rooms: 2}");
+    assert!(
+        sizes.contains("`small` has `rgb` of another form") && sizes.contains("[16, 24, 24, 3]"),
+        "{sizes}"
+    );
+    let empty = refused("rooms: 2}}, train: 4", "rooms: 2}}, train: 0");
+    assert!(empty.contains("`small` have no `train` split"), "{empty}");
 }

@@ -1,14 +1,16 @@
-//! `reviv data verify`: whether a folder of converted clips is whole.
+//! `reviv data verify`: whether a folder of converted clips or of tokens is whole.
 
 use super::super::terminal::{Failure, Terminal};
 use super::failure;
+use crate::datasets::shards;
 use crate::datasets::verify::verify;
+use crate::training::token_folder;
 use std::path::PathBuf;
 
-/// Check a folder of converted clips: every shard there, every file as it was written, every clip counted
+/// Check a folder of converted clips or of tokens: every shard there, every file as it was written, every clip counted
 #[derive(Debug, clap::Args)]
 pub(super) struct Verify {
-    /// A folder that `reviv data convert` or `synthesize` made
+    /// A folder that `reviv data convert`, `synthesize` or `tokenize` made
     #[arg(value_name = "DIR")]
     folder: PathBuf,
     /// Write the result as JSON to stdout
@@ -18,7 +20,23 @@ pub(super) struct Verify {
 
 impl Verify {
     pub(super) fn run(self, terminal: &Terminal) -> Result<(), Failure> {
-        let found = verify(&self.folder).map_err(failure)?;
+        let holds = |file: &str| self.folder.join(file).is_file();
+        let found = if holds(token_folder::FILE) {
+            token_folder::verify(&self.folder)
+        } else if holds(shards::FILE) {
+            verify(&self.folder)
+        } else {
+            let folder = self.folder.display();
+            return Err(Failure::input(
+                format!(
+                    "`{folder}` holds neither clips (`{}`) nor tokens (`{}`)",
+                    shards::FILE,
+                    token_folder::FILE
+                ),
+                "`reviv data convert`, `synthesize` and `tokenize` make such folders",
+            ));
+        };
+        let found = found.map_err(failure)?;
         if self.json {
             terminal.json(&found);
         } else {

@@ -33,7 +33,9 @@ impl Resolver<'_> {
             if matches!(port.arity, Arity::Optional | Arity::Any) {
                 return Some(Vec::new());
             }
-            let list = if port.arity == Arity::Many {
+            let list = if port.arity == Arity::OneOrMore {
+                format!("`{0}: STAGE` or `{0}: [STAGE, ...]`", port.name)
+            } else if port.arity == Arity::Many {
                 format!("`{}: [STAGE, ...]`", port.name)
             } else {
                 format!("`{}: STAGE`", port.name)
@@ -50,7 +52,8 @@ impl Resolver<'_> {
             return None;
         };
         traces.insert(port.name.to_owned(), Trace::of(node));
-        let many = matches!(port.arity, Arity::Many | Arity::Any);
+        let one = matches!(node.data, Data::Text(_)) && port.arity == Arity::OneOrMore;
+        let many = !one && !matches!(port.arity, Arity::One | Arity::Optional);
         let nodes: Vec<&Node> = match (&node.data, many) {
             (Data::List(nodes), true) => nodes.iter().collect(),
             (Data::Text(_), false) => vec![node],
@@ -76,7 +79,7 @@ impl Resolver<'_> {
                 return None;
             }
         };
-        if nodes.is_empty() && port.arity == Arity::Many {
+        if nodes.is_empty() && matches!(port.arity, Arity::Many | Arity::OneOrMore) {
             self.diagnostics.push(Diagnostic::new(
                 Code::E0301,
                 node.span,

@@ -4,33 +4,51 @@ use super::super::clip_signals::{damaged, format, modality, open_split};
 use super::super::device::compute;
 use super::super::modality_entry::DEFAULTS;
 use super::{TrainTokenizerSettings, picture, report, tokens};
+use crate::clip::joined::Joined;
 use crate::clip::source::ClipSource;
 use crate::engine::Precision;
 use crate::experiment::{Code, StageContext, StageError};
 use crate::run::checkpoint;
 use crate::training::tokenizer_scores::Scores;
-use crate::training::{Event, Flow, Intervals, Keep, TokenizerFit, TrainingError};
+use crate::training::{
+    DataError, Event, Flow, Intervals, Keep, Mixture, TokenizerFit, TrainingError,
+};
 use serde_json::{Value, json};
+use std::sync::Arc;
 
 pub(super) fn run(
     settings: &TrainTokenizerSettings,
     context: &mut dyn StageContext,
 ) -> Result<Value, StageError> {
-    let clips = context
-        .inputs("clips")
+    let artifacts = context.inputs("clips").to_vec();
+    let clips = artifacts
         .first()
-        .cloned()
         .ok_or_else(|| damaged("no clips arrived"))?;
-    let format = format(&clips)?;
+    let format = format(clips)?;
     let name = &settings.modality;
     let modality = modality(&format, name)
         .ok_or_else(|| damaged(&format!("the clips have no modality `{name}`")))?;
     let entry = settings
         .entry(clips.contents.get(DEFAULTS))
         .ok_or_else(|| damaged("no tokenizer is named"))?;
-    let train = open_split(&clips.path, "train")?
-        .ok_or_else(|| damaged("the clips have no `train` split"))?;
-    let held_out = open_split(&clips.path, "validation")?;
+    let mut sources: Vec<Arc<dyn ClipSource>> = Vec::new();
+    let mut held_out: Vec<Arc<dyn ClipSource>> = Vec::new();
+    for clips in &artifacts {
+        let train = open_split(&clips.path, "train")?;
+        sources.push(Arc::new(train.ok_or_else(|| {
+            damaged(&format!(
+                "the clips of `{}` have no `train` split",
+                clips.stage
+            ))
+        })?));
+        if let Some(validation) = open_split(&clips.path, "validation")? {
+            held_out.push(Arc::new(validation));
+        }
+    }
+    let names = artifacts.iter().map(|clips| clips.stage.as_str());
+    let sets: Vec<(&str, usize)> = names.zip(sources.iter().map(|set| set.len())).collect();
+    let train = Joined::new(sources);
+    let held_out = Joined::at_most(held_out, settings.validation_clips);
     let having = (0..train.len()).filter(|index| train.may_have(*index, name));
     let having = having.count();
     let resume = checkpoint::latest(context.checkpoints());
@@ -39,7 +57,11 @@ pub(super) fn run(
         modality: name,
         format: &format,
         train: &train,
-        held_out: held_out.as_ref().map(|clips| clips as &dyn ClipSource),
+        mixture: Mixture {
+            sets: &sets,
+            weights: (!settings.weights.is_empty()).then_some(settings.weights.as_slice()),
+        },
+        held_out: (!held_out.is_empty()).then_some(&held_out),
         held_out_clips: settings.validation_clips,
         tokenizer: &entry.settings,
         training: settings.training(having as u64),
@@ -189,6 +211,14 @@ fn failed(error: TrainingError, settings: &TrainTokenizerSettings) -> StageError
             code: Code::E0401,
             message: format!("no training clip has the modality `{}`", settings.modality),
             help: "take other clips, or leave this tokenizer out".to_owned(),
+        },
+        TrainingError::Data(DataError::Empty(set)) => StageError::Input {
+            code: Code::E0401,
+            message: format!(
+                "no training clip of `{set}` has the modality `{}`",
+                settings.modality
+            ),
+            help: "leave this data set out, or give it a weight of 0".to_owned(),
         },
         error @ (TrainingError::Clips(_) | TrainingError::Clip { .. }) => {
             damaged(&error.to_string())

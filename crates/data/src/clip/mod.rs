@@ -10,6 +10,7 @@
 pub mod clock;
 pub mod depth_video;
 pub mod frames;
+pub mod joined;
 pub mod shard;
 pub mod source;
 pub mod statistics;

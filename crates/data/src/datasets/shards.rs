@@ -96,10 +96,32 @@ impl Content {
             blake3: hasher.finalize().to_hex().to_string(),
         })
     }
+
+    /// Compares with what `file` below `root` holds now: its bytes, and what is wrong.
+    #[must_use]
+    pub fn compare(&self, root: &Path, file: &str) -> (u64, Option<String>) {
+        match Content::of(&root.join(file)) {
+            Ok(now) if now == *self => (now.bytes, None),
+            Ok(now) if now.bytes != self.bytes => {
+                let (now, then) = (now.bytes, self.bytes);
+                let problem = format!("`{file}` has {now} bytes instead of {then}");
+                (now, Some(problem))
+            }
+            Ok(now) => {
+                let problem = format!("`{file}` has other bytes than were written");
+                (now.bytes, Some(problem))
+            }
+            Err(ReadError::Io { cause, .. }) => (0, Some(format!("`{file}`: {cause}"))),
+            Err(error) => (0, Some(error.to_string())),
+        }
+    }
 }
 
 /// The tars of every modality and data set below a folder, by path from there: `rgb/adt/shard-000003.tar`.
-pub(super) fn tars(root: &Path) -> Result<Vec<String>, ReadError> {
+///
+/// # Errors
+/// When a folder cannot be read.
+pub fn tars(root: &Path) -> Result<Vec<String>, ReadError> {
     fn descend(
         root: &Path,
         folder: &Path,

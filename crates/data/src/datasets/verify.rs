@@ -2,7 +2,7 @@
 
 use super::ReadError;
 use super::convert::Tally;
-use super::shards::{Content, FILE, Folder, Marker, TarSink, tars};
+use super::shards::{FILE, Folder, Marker, TarSink, tars};
 use crate::clip::store::ClipSet;
 use crate::formats::read_error::Position;
 use rayon::prelude::*;
@@ -75,22 +75,7 @@ pub fn verify(root: &Path) -> Result<Verified, ReadError> {
     let checked: Vec<(u64, Option<String>)> = listed
         .collect::<Vec<_>>()
         .into_par_iter()
-        .map(|(file, written)| match Content::of(&root.join(file)) {
-            Ok(now) if now == *written => (now.bytes, None),
-            Ok(now) if now.bytes != written.bytes => {
-                let (now, then) = (now.bytes, written.bytes);
-                (
-                    now,
-                    Some(format!("`{file}` has {now} bytes instead of {then}")),
-                )
-            }
-            Ok(now) => {
-                let reason = format!("`{file}` has other bytes than were written");
-                (now.bytes, Some(reason))
-            }
-            Err(ReadError::Io { cause, .. }) => (0, Some(format!("`{file}`: {cause}"))),
-            Err(error) => (0, Some(error.to_string())),
-        })
+        .map(|(file, written)| written.compare(root, file))
         .collect();
     for (bytes, problem) in checked {
         found.files += 1;

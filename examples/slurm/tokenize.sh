@@ -1,0 +1,19 @@
+#!/bin/bash
+# Tokenizes clips with as many processes as the array has, each a part of the shards, into one folder on a shared disk:
+#   sbatch --array=1-16 examples/slurm/tokenize.sh /scratch/nymeria_clips /scratch/nymeria_tokens --tokenizers /models/tok_camera /models/tok_body
+# A part that is stopped goes on where it was when it is submitted again; `reviv data verify` says what is missing.
+#SBATCH --job-name=reviv-tokenize
+#SBATCH --cpus-per-task=8
+#SBATCH --mem=16G
+#SBATCH --time=12:00:00
+#SBATCH --requeue
+set -euo pipefail
+
+clips=$1
+tokens=$2
+shift 2
+# Scheduler variables count from the array's own first number.
+parts=${SLURM_ARRAY_TASK_COUNT:-1}
+part=$((${SLURM_ARRAY_TASK_ID:-1} - ${SLURM_ARRAY_TASK_MIN:-1} + 1))
+
+exec reviv data tokenize "$clips" -o "$tokens" --shard "$part/$parts" "$@"
