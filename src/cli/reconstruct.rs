@@ -193,11 +193,12 @@ impl Reconstruct {
                 .map_err(|error| Failure::machine(format_args!("{}: {error}", path.display())))?;
             path
         };
+        let runs = &self.place.runs;
         let mut set = vec![
             change("clips", "!unset"),
             change("model", "!unset"),
-            change("video", &text(&self.video)?),
-            change("model_folder", &text(model)?),
+            change("video", &text(&self.video, runs)?),
+            change("model_folder", &text(model, runs)?),
         ];
         if let Some(name) = &self.decoding {
             set.push(change("decoding", name));
@@ -206,10 +207,10 @@ impl Reconstruct {
             set.push(change("lens.field_of_view", &degrees.to_string()));
         }
         if let Some(path) = &self.anchor {
-            set.push(change("anchor", &text(path)?));
+            set.push(change("anchor", &text(path, runs)?));
         }
         if let Some(path) = &self.anchor_model {
-            set.push(change("anchor_model", &text(path)?));
+            set.push(change("anchor_model", &text(path, runs)?));
         }
         if let Some(seconds) = self.seconds {
             set.push(change("seconds", &seconds.to_string()));
@@ -275,19 +276,54 @@ fn change(key: &str, value: &str) -> String {
     format!("stages.{STAGE}.{key}={value}")
 }
 
-/// A path as a YAML string that does not depend on where the experiment lies.
-fn text(path: &Path) -> Result<String, Failure> {
-    let absolute = std::path::absolute(path).map_err(Failure::machine)?;
+/// A path as a YAML string that does not depend on where the experiment lies. An experiment is text: a file whose name is none
+/// gets a link among the runs.
+fn text(path: &Path, runs: &Path) -> Result<String, Failure> {
+    let mut absolute = std::path::absolute(path).map_err(Failure::machine)?;
+    if absolute.to_str().is_none() {
+        absolute = linked(&absolute, runs)?;
+    }
     let Some(text) = absolute.to_str() else {
-        return Err(Failure::input(
-            format!(
-                "`{}`: a name that is not UTF-8 cannot stand in an experiment",
-                absolute.display()
-            ),
-            "rename it, or give a link to it",
-        ));
+        let message = format!(
+            "`{}`: a name that is not UTF-8 cannot stand in an experiment",
+            absolute.display()
+        );
+        return Err(Failure::input(message, "rename it, or give a link to it"));
     };
     Ok(serde_json::Value::from(text).to_string())
+}
+
+/// A link below `runs` with a name that is text, the same for the same file.
+#[cfg(unix)]
+fn linked(file: &Path, runs: &Path) -> Result<PathBuf, Failure> {
+    use std::os::unix::ffi::OsStrExt as _;
+    let wrong =
+        |error: std::io::Error| Failure::machine(format_args!("{}: {error}", runs.display()));
+    let plain = |part: Option<&std::ffi::OsStr>| {
+        let part = part.unwrap_or_default().to_string_lossy();
+        part.replace(
+            |c: char| !c.is_ascii_alphanumeric() && !"-_".contains(c),
+            "_",
+        )
+    };
+    let hash = blake3::hash(file.as_os_str().as_bytes()).to_hex();
+    let mut name = format!("{}-{}", plain(file.file_stem()), &hash[..8]);
+    if file.extension().is_some() {
+        name = format!("{name}.{}", plain(file.extension()));
+    }
+    let folder = std::path::absolute(runs.join("links")).map_err(wrong)?;
+    std::fs::create_dir_all(&folder).map_err(wrong)?;
+    let link = folder.join(name);
+    match std::os::unix::fs::symlink(file, &link) {
+        Err(error) if error.kind() != std::io::ErrorKind::AlreadyExists => Err(wrong(error)),
+        _ => Ok(link),
+    }
+}
+
+/// Names of files are text here.
+#[cfg(not(unix))]
+fn linked(file: &Path, _runs: &Path) -> Result<PathBuf, Failure> {
+    Ok(file.to_owned())
 }
 
 /// The folder of a model: `given` is one, or a run that trained one; without it, the latest run that did.
