@@ -29,7 +29,7 @@ fn tiny() -> NetworkSettings {
 }
 
 /// A folder of a small network with random weights that says far and near.
-fn random_network(folder: &Path, kind: DepthLabelKind) {
+pub fn random_network(folder: &Path, kind: DepthLabelKind) {
     std::fs::create_dir_all(folder).unwrap();
     let compute = Compute::cpu();
     let mut network = DepthNetwork::new(&Initialise::new(&compute, 4), &tiny()).unwrap();

@@ -366,3 +366,69 @@ fn an_earlier_result_is_replaced_only_where_nothing_was_put_beside_it() {
     assert!(foreign.is_file());
     assert!(files(&place.path("out")) == made, "something is gone");
 }
+
+#[test]
+fn a_depth_network_gives_the_metric_scale_of_a_whole_video() {
+    let place = Place::new();
+    crate::labelling::random_network(
+        &place.path("network"),
+        reviv::labelling::DepthLabelKind::Metric,
+    );
+    // More than one window of the network.
+    pictures(&place.path("walk"), 70, [48, 40], false);
+    let with = |output: &str| {
+        let mut command = place.command("walk", output);
+        command.args(["--anchor-model", "network", "--runs", output]);
+        command.assert().success();
+        std::fs::read_to_string(place.path(output).join("manifest.json")).unwrap()
+    };
+    let manifest: serde_json::Value = serde_json::from_str(&with("one")).unwrap();
+    let scale = manifest["scale"].to_string();
+    assert!(
+        scale.contains("anchor") || manifest["refused"].is_string(),
+        "{manifest}"
+    );
+    place.command("walk", "none").assert().success();
+    let none = std::fs::read_to_string(place.path("none/manifest.json")).unwrap();
+    assert!(!none.contains("anchor_model"), "{none}");
+    // Labels of the other kind have no metres.
+    crate::labelling::random_network(
+        &place.path("relative"),
+        reviv::labelling::DepthLabelKind::Relative,
+    );
+    let output = place
+        .command("walk", "two")
+        .args(["--anchor-model", "relative"])
+        .assert()
+        .code(1);
+    let said = String::from_utf8_lossy(&output.get_output().stderr).into_owned();
+    assert!(said.contains("relative"), "{said}");
+}
+
+#[cfg(unix)]
+#[test]
+fn a_video_whose_name_is_no_text_is_reconstructed_too() {
+    use std::os::unix::ffi::OsStrExt as _;
+    let place = Place::new();
+    let name = std::ffi::OsStr::from_bytes(b"walk\xff");
+    pictures(&place.path("walk"), 20, [40, 40], false);
+    std::fs::rename(place.path("walk"), place.path("").join(name)).unwrap();
+    let command = place.command("none", "one");
+    let arguments: Vec<std::ffi::OsString> = command
+        .get_args()
+        .map(|argument| {
+            if argument == "none" {
+                name.to_owned()
+            } else {
+                argument.to_owned()
+            }
+        })
+        .collect();
+    let mut command = Command::new(env!("CARGO_BIN_EXE_reviv"));
+    command
+        .current_dir(place.path(""))
+        .args(arguments)
+        .assert()
+        .success();
+    assert!(place.path("one/camera.tum").is_file());
+}
