@@ -12,6 +12,8 @@ mod import;
 mod list;
 mod new;
 mod plan;
+mod plan_devices;
+mod ranks;
 mod reconstruct;
 mod request;
 mod run;

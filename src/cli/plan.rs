@@ -1,5 +1,6 @@
 //! `reviv plan`: the resolved graph, without running it.
 
+use super::plan_devices::Devices;
 use super::request::{Changes, count, open};
 use super::terminal::{Failure, Terminal};
 use crate::experiment::catalog::Catalog;
@@ -23,6 +24,8 @@ pub struct Plan {
     /// Write JSON to stdout
     #[arg(long)]
     json: bool,
+    #[command(flatten)]
+    devices: Devices,
 }
 
 impl super::Run for Plan {
@@ -48,6 +51,7 @@ impl super::Run for Plan {
             terminal.json(&planned);
         } else {
             terminal.data(render(&planned));
+            terminal.data(self.devices.render(&experiment, &planned.stages)?);
         }
         Ok(())
     }

@@ -93,6 +93,7 @@ enum Export {
 
 impl super::Run for Reconstruct {
     fn run(self, terminal: &Terminal) -> Result<(), Failure> {
+        super::ranks::only_one(terminal, "reconstruct")?;
         if !self.video.exists() {
             return Err(Failure::input(
                 format!("no file `{}`", self.video.display()),

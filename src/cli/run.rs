@@ -1,8 +1,11 @@
 //! `reviv run`: an experiment or a sweep, from where it stands to its end.
 
-use super::request::{Changes, open};
+use super::ranks::{self, Root};
+use super::request::Changes;
 use super::sweep_table;
 use super::terminal::{Failure, Terminal};
+use crate::engine::Communicator;
+use crate::experiment::Experiment;
 use crate::experiment::catalog::Catalog;
 use crate::run::execute::{Job, Outcome, execute};
 use crate::run::{Interrupt, Progress, RunError, Shard, State, WorkerPool};
@@ -40,22 +43,71 @@ pub struct RunsDir {
 
 impl super::Run for Run {
     fn run(self, terminal: &Terminal) -> Result<(), Failure> {
+        let world = ranks::join(terminal, self.shard != Shard::WHOLE)?;
+        if !world.is_root() {
+            let request = self.changes.request(&self.file);
+            let served = ranks::serve(&world, &request, &self.place.runs);
+            ranks::leave(&world, None, served.is_err(), terminal);
+            // Rank 0 ends with the code of the run.
+            return Ok(());
+        }
+        let (root, result) = self.alone(&world, terminal);
+        ranks::leave(&world, root, result.is_err(), terminal);
+        result
+    }
+}
+
+impl Run {
+    /// What one process does, or rank 0 of several.
+    fn alone(
+        self,
+        world: &Communicator,
+        terminal: &Terminal,
+    ) -> (Option<&'static Root>, Result<(), Failure>) {
         let catalog = Catalog::linked();
-        let (experiment, _) = open(&catalog, &self.changes.request(&self.file), terminal)?;
+        let request = self.changes.request(&self.file);
+        let opened = ranks::open_together(
+            world,
+            &catalog,
+            &request,
+            &self.place.runs,
+            &progress(terminal),
+            terminal,
+        );
+        match opened {
+            Ok(experiment) => {
+                let root = Root::of(world);
+                (root, self.execute(&catalog, &experiment, root, terminal))
+            }
+            Err(failure) => (None, Err(failure)),
+        }
+    }
+
+    fn execute(
+        self,
+        catalog: &Catalog,
+        experiment: &Experiment,
+        root: Option<&'static Root>,
+        terminal: &Terminal,
+    ) -> Result<(), Failure> {
         let interrupt = interruptible(terminal)?;
         let progress = progress(terminal);
+        let crew = match root {
+            Some(root) => WorkerPool::together(root),
+            None => WorkerPool::of_this_machine(self.jobs.map(usize::from)),
+        };
         let job = Job {
-            experiment: &experiment,
+            experiment,
             runs: &self.place.runs,
             only: self.only.as_deref(),
             shard: self.shard,
-            crew: WorkerPool::of_this_machine(self.jobs.map(usize::from)),
+            crew,
             progress: &progress,
             interrupt: &interrupt,
         };
         let outcome = execute(&job).map_err(|error| tell(terminal, &error))?;
         if let (State::Done, Some(compare)) = (outcome.state, &experiment.compare) {
-            let table = sweep_table::write(&catalog, &experiment, compare, &outcome.run)?;
+            let table = sweep_table::write(catalog, experiment, compare, &outcome.run)?;
             terminal.note(format_args!("\n{table}\n"));
         }
         finish(terminal, &outcome, &interrupt)

@@ -28,6 +28,7 @@ pub mod problem;
 pub mod registry;
 mod resolve;
 pub mod resolved;
+pub mod scaling;
 pub mod schema;
 pub mod source;
 pub mod stage;

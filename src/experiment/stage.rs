@@ -117,6 +117,8 @@ pub struct StagePlan {
     pub seconds: Option<f64>,
     /// Seconds of one processor core for work on data, by what was measured on one machine: an order of magnitude.
     pub core_seconds: Option<f64>,
+    /// Of a training: nominal tokens of one step, over all devices.
+    pub tokens_per_step: Option<f64>,
     /// Anything worth a line.
     pub lines: Vec<String>,
 }
@@ -166,6 +168,11 @@ pub trait Op: Send + Sync + 'static {
         true
     }
 
+    /// Whether the processes of a job do it together: its `run` is called on every rank, and only that of rank 0 may write.
+    fn together(&self) -> bool {
+        false
+    }
+
     /// Files outside the experiment that it reads.
     fn files(&self, _settings: &Self::Settings) -> Vec<FileInput> {
         Vec::new()
@@ -212,6 +219,7 @@ pub trait AnyOp: Send + Sync + 'static {
     fn inputs(&self) -> &'static [Port];
     fn output(&self) -> ArtifactKind;
     fn seeded(&self) -> bool;
+    fn together(&self) -> bool;
     /// The schema of the settings, without `op` and the ports.
     fn schema(&self, generator: &mut SchemaGenerator) -> Schema;
     /// Settings with every default filled in.
@@ -251,6 +259,9 @@ impl<O: Op> AnyOp for O {
     }
     fn seeded(&self) -> bool {
         Op::seeded(self)
+    }
+    fn together(&self) -> bool {
+        Op::together(self)
     }
     fn schema(&self, generator: &mut SchemaGenerator) -> Schema {
         generator.subschema_for::<O::Settings>()

@@ -109,6 +109,10 @@ impl Op for TrainMget {
         3
     }
 
+    fn together(&self) -> bool {
+        true
+    }
+
     fn about(&self) -> &'static str {
         "Trains a Masked Generative Egocentric Transformer on token grids."
     }
@@ -271,6 +275,7 @@ impl Op for TrainMget {
             flop: Some(6.0 * forward * samples as f64),
             seconds: None,
             core_seconds: None,
+            tokens_per_step: Some(training.batch as f64 * measure.tokens_per_sample as f64),
             lines: vec![
                 format!(
                     "{:.0}% of nominal tokens are real: {:.0} of {} visible, {:.0} of {} asked for per sample",

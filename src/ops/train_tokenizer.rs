@@ -12,6 +12,7 @@ use super::clip_signals::{described_format, modality, unknown_modality};
 use super::modality_entry::{DEFAULTS, read_defaults};
 use super::tokenize::ENCODE_SECONDS;
 use super::tokenizer_entry::TokenizerEntry;
+use crate::engine::communicator::reduce::Reduction;
 use crate::engine::{Compute, DeviceChoice, Initialise, Parameters};
 use crate::experiment::{
     Arity, ArtifactKind, Code, Description, Entry, InputFacts, Inputs, Op, OpEntry, Port, Problem,
@@ -43,8 +44,10 @@ pub struct TrainTokenizerSettings {
     /// Signals per step.
     #[schemars(range(min = 1))]
     pub batch: usize,
-    /// Signals per forward pass; a larger `batch` accumulates gradients. 0 means `batch`.
+    /// Signals per forward pass; a larger `batch` accumulates gradients, and ranks share them. 0 means `batch`, shared evenly.
     pub micro_batch: usize,
+    /// In which order ranks add up gradients.
+    pub reduction: Reduction,
     /// Peak learning rate; it falls along half a cosine.
     pub learning_rate: f64,
     /// Linear rise from 0: `{steps: n}` or `{epochs: x}`.
@@ -81,6 +84,7 @@ impl Default for TrainTokenizerSettings {
             steps: training.steps,
             batch: training.batch,
             micro_batch: training.micro_batch,
+            reduction: training.reduction,
             learning_rate: training.learning_rate,
             warmup: Duration::Steps(training.warmup),
             optimizer: training.optimizer,
@@ -103,6 +107,7 @@ impl TrainTokenizerSettings {
             steps: self.steps,
             batch: self.batch,
             micro_batch: self.micro_batch,
+            reduction: self.reduction,
             learning_rate: self.learning_rate,
             warmup: self.warmup_steps(signals).unwrap_or_default(),
             optimizer: self.optimizer.clone(),
@@ -151,6 +156,10 @@ impl Op for TrainTokenizer {
 
     fn version(&self) -> u32 {
         6
+    }
+
+    fn together(&self) -> bool {
+        true
     }
 
     fn about(&self) -> &'static str {

@@ -210,6 +210,7 @@ impl Worker<'_> {
             data: &self.schedule.data,
             progress,
             interrupt: self.job.interrupt,
+            peers: self.job.crew.peers,
         };
         let made = stage::make(work, label, &directory, &around)?;
         progress.say(&format!(

@@ -34,6 +34,8 @@ pub struct Fingerprints<'a> {
     taken: BTreeMap<PathBuf, Fingerprint>,
     /// The folder of the memory.
     memory: Option<PathBuf>,
+    /// Whether the memory is another process's to write.
+    borrowed: bool,
     /// Whom to tell how far it is, and who may stop it.
     watched: Option<(&'a Progress, &'a Interrupt)>,
 }
@@ -44,6 +46,14 @@ impl<'a> Fingerprints<'a> {
         Self {
             memory: Some(cache.root().join("fingerprints")),
             ..Self::default()
+        }
+    }
+
+    /// With the memory of a cache that another process keeps: writes nothing.
+    pub fn borrowed(cache: &Cache) -> Self {
+        Self {
+            borrowed: true,
+            ..Self::remembered(cache)
         }
     }
 
@@ -59,8 +69,11 @@ impl<'a> Fingerprints<'a> {
         if let Some(known) = self.taken.get(path) {
             return Ok(*known);
         }
-        let print =
-            Scan::at(path, self.memory.as_deref())?.take(self.watched, environment::now())?;
+        let mut scan = Scan::at(path, self.memory.as_deref())?;
+        if self.borrowed {
+            scan.memory = None;
+        }
+        let print = scan.take(self.watched, environment::now())?;
         self.taken.insert(path.to_path_buf(), print);
         Ok(print)
     }

@@ -4,7 +4,7 @@
 //! * [`record`] the run directory and its state; [`cache`] where artifacts live; [`lock`] who may write; [`files`] how anything
 //!   is written; [`error`] what can go wrong
 //! * [`checkpoint`] what a stage keeps to go on from; [`metrics`] and [`tensorboard`] what a stage records; [`progress`] what a person sees meanwhile; [`interrupt`] Ctrl-C
-//! * [`schedule`] what there is to do; [`stage`] one piece of it, and `context` what its op sees; [`worker_pool`] several at once; [`execute`] all of it
+//! * [`schedule`] what there is to do; [`stage`] one piece of it, and `context` what its op sees; [`worker_pool`] several at once; [`stage::peers`] several processes at one; [`execute`] all of it
 //! * [`inputs`] what lies outside; [`provenance`] where everything came from; [`report`] the run's page
 //! * [`verify`] whether it still holds; [`gc`] what can go
 //! * [`environment`] the only place that looks at machine, git and clock
@@ -39,4 +39,5 @@ pub use error::RunError;
 pub use interrupt::Interrupt;
 pub use progress::Progress;
 pub use record::{RunDirectory, Shard, State};
+pub use stage::peers::Peers;
 pub use worker_pool::WorkerPool;

@@ -1,5 +1,8 @@
 //! One stage at work: what its op sees of the run, and what stays of it.
 
+pub mod peers;
+
+use self::peers::{Part, Peers};
 use super::cache::{Cache, Entry, Key, Made, Recipe};
 use super::context::{Context, explain, panic_text};
 use super::environment;
@@ -98,6 +101,8 @@ pub struct Surroundings<'a> {
     pub data: &'a BTreeMap<String, PathBuf>,
     pub progress: &'a Progress,
     pub interrupt: &'a Interrupt,
+    /// Other processes, for the stages that all do together.
+    pub peers: Option<&'a dyn Peers>,
 }
 
 /// Does one piece of work in `directory` and puts the artifact into the cache. The caller holds the key's lock.
@@ -213,6 +218,23 @@ fn perform(
         Ok(prepared) => prepared,
         Err(error) => return (0.0, Err(error)),
     };
+    let peers = around.peers.filter(|_| op.together());
+    let lost = |message: String| {
+        RunError::Stage {
+        stage: work.stage.clone(),
+        code: "E0808".into(),
+        message,
+        help: "mend it there and ask for the same experiment again, on any number of ranks: it continues".into(),
+        exit: 2,
+    }
+    };
+    if let Some(peers) = peers {
+        let (checkpoints, output) = (&context.checkpoints, &context.output);
+        let part = Part::new(work, checkpoints, output, around.data);
+        if let Err(message) = peers.begin(&part) {
+            return (0.0, context.close(Err(lost(message))));
+        }
+    }
     // A panic is a bug of the op; the rest of the run and its record must not suffer from it.
     let result = catch_unwind(AssertUnwindSafe(|| op.run(&work.settings, &mut context)));
     let result = match result {
@@ -226,6 +248,10 @@ fn perform(
             exit: 2,
         }),
     };
+    let ended = peers.map_or(Ok(()), |peers| {
+        peers.end(result.as_ref().map(drop).map_err(ToString::to_string))
+    });
+    let result = result.and_then(|contents| ended.map_err(lost).map(|()| contents));
     (context.task.seconds(), context.close(result))
 }
 
@@ -276,7 +302,10 @@ pub fn recipe(work: &Task) -> Recipe {
     }
 }
 
-fn inputs(work: &Task, cache: &Cache) -> Result<Vec<(String, Vec<InputArtifact>)>, RunError> {
+pub(super) fn inputs(
+    work: &Task,
+    cache: &Cache,
+) -> Result<Vec<(String, Vec<InputArtifact>)>, RunError> {
     let mut ports = Vec::new();
     for port in &work.inputs {
         let mut artifacts = Vec::new();

@@ -80,6 +80,7 @@ pub fn verify(
                 data: &schedule.data,
                 progress,
                 interrupt,
+                peers: None,
             };
             checks.push(again(run, work, &label, redo, &around)?);
         }

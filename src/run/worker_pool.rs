@@ -7,11 +7,12 @@ use super::cache::Key;
 use super::environment;
 use super::error::RunError;
 use super::schedule::Task;
+use super::stage::peers::Peers;
 use std::collections::BTreeMap;
 use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
 
 /// What the stages of one process may take of the machine together.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy)]
 pub struct WorkerPool {
     /// Stages at once, at most.
     pub jobs: usize,
@@ -19,6 +20,8 @@ pub struct WorkerPool {
     pub threads: usize,
     /// Bytes of all stages together, as planned; one stage alone may exceed it.
     pub memory: Option<u64>,
+    /// Other processes that do some stages together with this one.
+    pub peers: Option<&'static dyn Peers>,
 }
 
 /// What went wrong.
@@ -51,6 +54,16 @@ impl WorkerPool {
             jobs: jobs.unwrap_or(usual).max(1),
             threads,
             memory: environment::memory().map(|bytes| bytes / 2),
+            peers: None,
+        }
+    }
+
+    /// One stage after the other, some of them together with other processes.
+    #[must_use]
+    pub fn together(peers: &'static dyn Peers) -> Self {
+        Self {
+            peers: Some(peers),
+            ..Self::alone()
         }
     }
 
@@ -284,6 +297,7 @@ mod tests {
             jobs,
             threads: 4,
             memory: Some(100),
+            peers: None,
         }
     }
 

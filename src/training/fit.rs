@@ -2,7 +2,7 @@
 
 use super::trainer::{HeldOut, Objective, StepReport, Trainer, TrainingError};
 use super::validation::Score;
-use crate::engine::Parameters;
+use crate::engine::{Communicator, Parameters, RankError};
 use crate::flow::Flow;
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -88,13 +88,37 @@ pub(super) fn progress<E: From<TrainingError>>(
     }
 }
 
+/// Every rank comes to the same decision: to stop where one of them is asked to.
+fn agreed<E: From<TrainingError> + std::fmt::Display>(
+    ranks: &Communicator,
+    flow: Result<Flow, E>,
+) -> Result<bool, E> {
+    let told = flow.as_ref().map(|flow| *flow == Flow::Stop);
+    let any = ranks.any(told.map_err(ToString::to_string));
+    flow?;
+    Ok(any.map_err(TrainingError::from)?)
+}
+
+/// Ranks that continue from different checkpoints are refused.
+fn same_step(ranks: &Communicator, step: u64) -> Result<(), RankError> {
+    let steps = ranks.gather(Ok(step.to_le_bytes().to_vec()))?;
+    let other = steps.iter().position(|other| *other != step.to_le_bytes());
+    other.map_or(Ok(()), |rank| {
+        let reason = format!(
+            "rank {} is at step {step}: do all see the same checkpoints?",
+            ranks.rank()
+        );
+        Err(ranks.odd(rank, &reason))
+    })
+}
+
 /// Trains to the last step. `batch(step, i)` gives micro-batch `i` of `step` (counted from 0), in order; `validate` gives held-out
-/// losses by modality, nothing where there are none. Returns the step whose weights the model has, with its held-out losses.
+/// losses by modality, nothing where there are none; of several ranks each calls it, `batch` for its own micro-batches. Returns the step whose weights the model has, with its held-out losses.
 ///
 /// # Errors
 /// What `batch`, `validate` or `callback` says, or when loss or gradient are not finite; the trainer is as after its last step.
 /// [`TrainingError::Stopped`] after a last checkpoint, where the callback stops it before its end.
-pub fn fit<O: Objective, E: From<TrainingError>>(
+pub fn fit<O: Objective, E: From<TrainingError> + std::fmt::Display>(
     trainer: &mut Trainer<O>,
     intervals: Intervals,
     mut batch: impl FnMut(u64, usize) -> Result<O::Batch, E>,
@@ -102,42 +126,46 @@ pub fn fit<O: Objective, E: From<TrainingError>>(
     callback: &mut Callback<'_, E>,
 ) -> Result<HeldOut, E> {
     let total = trainer.total_steps();
+    let ranks = trainer.ranks().communicator().clone();
+    same_step(&ranks, trainer.progress().step).map_err(TrainingError::from)?;
     let mut validated = |trainer: &mut Trainer<O>, callback: &mut Callback<'_, E>| {
         let held_out = HeldOut {
             step: trainer.progress().step,
             scores: validate(trainer.objective())?,
             ..HeldOut::default()
         };
-        let mut flow = Flow::Continue;
+        let mut stop = false;
         if !held_out.scores.is_empty() {
-            flow = callback(Event::Validation(&held_out))?;
+            stop = agreed(&ranks, callback(Event::Validation(&held_out)))?;
             trainer.note(held_out.clone());
         }
-        Ok::<_, E>((held_out, flow))
+        Ok::<_, E>((held_out, stop))
     };
-    let mut stop = callback(Event::Start {
+    let start = Event::Start {
         parameters: trainer.model().count(),
         step: trainer.progress().step,
         total,
-    })? == Flow::Stop;
+    };
+    let mut stop = agreed(&ranks, callback(start))?;
     while trainer.progress().step < total {
         if stop {
-            callback(Event::Checkpoint(trainer))?;
+            agreed(&ranks, callback(Event::Checkpoint(trainer)))?;
             return Err(TrainingError::Stopped.into());
         }
         let step = trainer.progress().step;
         let report = trainer.step(|index| batch(step, index))?;
         let step = report.step;
-        stop |= callback(Event::Step {
+        let report = Event::Step {
             report: &report,
             total,
-        })? == Flow::Stop;
+        };
+        stop |= agreed(&ranks, callback(report))?;
         let due = |every: u64| every > 0 && step.is_multiple_of(every) && step < total;
         if due(intervals.validate_every) {
-            stop |= validated(trainer, callback)?.1 == Flow::Stop;
+            stop |= validated(trainer, callback)?.1;
         }
         if due(intervals.checkpoint_every) && !stop {
-            stop |= callback(Event::Checkpoint(trainer))? == Flow::Stop;
+            stop |= agreed(&ranks, callback(Event::Checkpoint(trainer)))?;
         }
     }
     let (last, _) = validated(trainer, callback)?;

@@ -81,9 +81,14 @@ pub struct Loader {
 }
 
 impl Loader {
-    /// Starts `threads` threads that prepare the micro-batches of steps `steps`.
+    /// Starts `threads` threads that prepare the micro-batches of steps `steps` that are `own` in each step.
     #[must_use]
-    pub fn start(feed: &Arc<BatchSource>, steps: std::ops::Range<u64>, threads: usize) -> Self {
+    pub fn start(
+        feed: &Arc<BatchSource>,
+        steps: std::ops::Range<u64>,
+        own: &[usize],
+        threads: usize,
+    ) -> Self {
         let threads = threads.max(1);
         let mut loader = Self {
             channels: Vec::new(),
@@ -91,15 +96,19 @@ impl Loader {
             next: 0,
             waited: 0.0,
         };
-        let micro_batches = feed.micro_batches.len() as u64;
+        let micro_batches = own.len().max(1) as u64;
         for thread in 0..threads {
             let (sender, receiver) = sync_channel(AHEAD);
-            let feed = Arc::clone(feed);
+            let (feed, own) = (Arc::clone(feed), own.to_vec());
             let items = steps.start * micro_batches..steps.end * micro_batches;
             // Thread k prepares every item k, k + threads, ...: order needs no agreement between threads.
             let work = move || {
                 for item in items.skip(thread).step_by(threads) {
-                    let batch = feed.batch(item / micro_batches, (item % micro_batches) as usize);
+                    let micro = own
+                        .get((item % micro_batches) as usize)
+                        .copied()
+                        .unwrap_or(0);
+                    let batch = feed.batch(item / micro_batches, micro);
                     let failed = batch.is_err();
                     if sender.send(batch).is_err() || failed {
                         return;

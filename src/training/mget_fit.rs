@@ -5,11 +5,12 @@ use super::loader::{BatchSource, Loader};
 use super::sampler::Sampler;
 use super::settings::{DatasetSize, TrainingSettings};
 use super::source::{InMemory, TokenSample, TokenSource};
+use super::trainer::ranks::Ranks;
 use super::trainer::{HeldOut, Progress, StepReport, Trainer, TrainingError};
 use super::validation::{Score, Unigram, Validation};
 use super::{Duration, Objective};
 use crate::clip::source::{ClipSource, Outcome};
-use crate::engine::{Compute, Initialise};
+use crate::engine::{Communicator, Compute, Initialise};
 use crate::flow::Flow;
 use crate::masking::{Alphas, Masking, MaskingSettings, PIXELS, TokenBudget};
 use crate::mget::{Mget, MgetSpec, ModalitySpec, Positions, Size};
@@ -40,6 +41,8 @@ pub struct MgetFit<'a> {
     pub settings: &'a TrainingSettings,
     /// Where it trains.
     pub compute: &'a Compute,
+    /// Who trains it together.
+    pub ranks: Communicator,
     /// Of initial weights, order and masks.
     pub seed: u64,
     /// A checkpoint to continue from.
@@ -73,7 +76,7 @@ impl MgetFit<'_> {
     ///
     /// # Errors
     /// When settings or tokens do not fit the model, a clip cannot be read, the loss is not finite, or `callback` stops it.
-    pub fn run<E: From<TrainingError>>(
+    pub fn run<E: From<TrainingError> + std::fmt::Display>(
         self,
         callback: &mut Callback<'_, E>,
     ) -> Result<FittedMget, E> {
@@ -83,6 +86,7 @@ impl MgetFit<'_> {
             sources,
             lengths,
             settings,
+            ranks,
             seed,
             clock,
             ..
@@ -95,13 +99,12 @@ impl MgetFit<'_> {
             tokens_per_sample: (input + target) as u64,
         };
         let schedule = settings.learning_rates(size).map_err(TrainingError::from)?;
-        let micro_batches = settings.micro_batches();
         let validation = Validation::new(
             &spec,
             &masking,
             self.held_out,
             settings.validation_clips,
-            micro_batches.first().copied().unwrap_or(1),
+            settings.micro_batches().first().copied().unwrap_or(1),
             seed,
         )
         .map_err(wrap)?;
@@ -109,10 +112,15 @@ impl MgetFit<'_> {
         let baseline = validation.baseline(&unigram);
         let model =
             Mget::new(&spec, &Initialise::new(self.compute, seed)).map_err(TrainingError::from)?;
-        let mut trainer = Trainer::new(model, settings, schedule);
+        let together = Ranks::new(ranks.clone(), settings.reduction);
+        let mut trainer = Trainer::new(model, settings, schedule)
+            .shared(together, settings.micro_batch)
+            .map_err(TrainingError::from)?;
         if let Some(checkpoint) = &self.resume {
             trainer.resume(checkpoint)?;
         }
+        let micro_batches = trainer.micro_batches().to_vec();
+        let own: Vec<usize> = ranks.own(micro_batches.len()).collect();
         let batches = Arc::new(BatchSource {
             spec,
             masking,
@@ -123,7 +131,7 @@ impl MgetFit<'_> {
             repeat: settings.repeat,
         });
         let steps = trainer.progress().step..trainer.total_steps();
-        let loader = Loader::start(&batches, steps, settings.loader_threads);
+        let loader = Loader::start(&batches, steps, &own, settings.loader_threads);
         let loader = RefCell::new(loader);
         let mut tell = |event: Event<'_>| match event {
             Event::Step { report, total } => {
@@ -147,7 +155,10 @@ impl MgetFit<'_> {
                 checkpoint_every: settings.checkpoint_every,
             },
             |_, _| Ok(loader.borrow_mut().next(clock).map_err(wrap)?),
-            |objective| Ok(validation.run(objective.module())),
+            |objective| {
+                let losses = validation.run(objective.module(), &ranks);
+                Ok(losses.map_err(TrainingError::from)?)
+            },
             &mut tell,
         )?;
         Ok(FittedMget {
@@ -262,6 +273,7 @@ impl Model {
             held_out: &held_out,
             settings: &options.training,
             compute: &options.compute,
+            ranks: Communicator::alone(),
             seed: options.seed,
             resume: None,
             clock: &|| 0.0,

@@ -1,9 +1,10 @@
 //! Training that can be trusted (Supp. B).
 //!
 //! Read in this order: [`settings`], [`source`] (where tokens come from), [`sampler`] (which clip stands where), [`loader`]
-//! (batches prepared ahead), [`trainer`] (**one step, and the state between steps**), [`mod@fit`] (the loop), [`validation`],
-//! [`optimizer`], [`schedule`]. Trained are [`mget`] and [`tokenizer`]s; [`kmeans`] is what the latter have to beat. [`mget_fit`] and
-//! [`tokenizer_fit`] are the way from clips to a model; a [`mixture`] is what a tokenizer learns from.
+//! (batches prepared ahead), [`trainer`] (**one step, and the state between steps**), [`trainer::ranks`] (a step on several
+//! processes), [`mod@fit`] (the loop), [`validation`], [`optimizer`], [`schedule`]. Trained are [`mget`] and [`tokenizer`]s;
+//! [`kmeans`] is what the latter have to beat. [`mget_fit`] and [`tokenizer_fit`] are the way from clips to a model; a [`mixture`]
+//! is what a tokenizer learns from.
 //!
 //! Data order, masks and initial weights are functions of the seed and the step, so a run that was killed and resumed has the
 //! same bytes as one that was not.
@@ -43,5 +44,6 @@ pub use settings::{DatasetSize, Duration, Keep, TrainingSettings};
 pub use shards::Shards;
 pub use source::{DataError, InMemory, TokenSample, TokenSource};
 pub use tokenizer_fit::{FittedTokenizer, TokenizerFit, TokenizerOptions};
+pub use trainer::ranks::Ranks;
 pub use trainer::{HeldOut, Objective, Progress, StepReport, Trainer, TrainingError};
 pub use validation::{Score, Unigram, Validation};

@@ -2,6 +2,7 @@
 
 use super::optimizer::AdamWSettings;
 use super::schedule::{Schedule, ScheduleError, Shape};
+use crate::engine::communicator::reduce::Reduction;
 use crate::mget::Loss;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -19,8 +20,10 @@ pub struct TrainingSettings {
     /// Samples per optimizer step, over all micro-batches.
     #[schemars(range(min = 1))]
     pub batch: usize,
-    /// Samples per forward pass; a larger `batch` accumulates gradients. 0 means `batch`.
+    /// Samples per forward pass; a larger `batch` accumulates gradients, and ranks share them. 0 means `batch`, shared evenly.
     pub micro_batch: usize,
+    /// In which order ranks add up gradients.
+    pub reduction: Reduction,
     /// Compute the activations of each block once more in backward instead of keeping them: less memory, more time.
     pub activation_checkpointing: bool,
     /// Peak learning rate. The paper: 1e-4 per 256 samples, so 4e-4 at batch 1024.
@@ -59,6 +62,7 @@ impl Default for TrainingSettings {
             total_tokens: None,
             batch: 16,
             micro_batch: 0,
+            reduction: Reduction::default(),
             activation_checkpointing: false,
             learning_rate: 1e-3,
             final_learning_rate: 0.0,

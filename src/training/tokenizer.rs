@@ -15,8 +15,9 @@ use super::source::DataError;
 use super::trainer::{MicroStep, Objective, Progress, Trainer, TrainingError};
 use super::validation::Score;
 use crate::clip::Signal;
+use crate::engine::communicator::reduce::Reduction;
 use crate::engine::parameters::to_host;
-use crate::engine::{Gradients, Parameters};
+use crate::engine::{Communicator, Gradients, Parameters, RankError};
 use crate::geometry::skeleton::HAND;
 use crate::random::stream;
 use crate::tokenizer::quantizer::Assignment;
@@ -40,8 +41,10 @@ pub struct TokenizerTraining {
     /// Signals per step.
     #[schemars(range(min = 1))]
     pub batch: usize,
-    /// Signals per forward pass; a larger `batch` accumulates gradients. 0 means `batch`.
+    /// Signals per forward pass; a larger `batch` accumulates gradients, and ranks share them. 0 means `batch`, shared evenly.
     pub micro_batch: usize,
+    /// In which order ranks add up gradients.
+    pub reduction: Reduction,
     /// Peak learning rate.
     pub learning_rate: f64,
     /// Steps until the peak.
@@ -58,6 +61,7 @@ impl Default for TokenizerTraining {
             steps: 1000,
             batch: 16,
             micro_batch: 0,
+            reduction: Reduction::default(),
             learning_rate: 1e-3,
             warmup: 50,
             optimizer: AdamWSettings {
@@ -190,19 +194,29 @@ pub struct VqReconstruction {
 }
 
 impl VqReconstruction {
-    /// The reconstruction loss of held-out signals; nothing where there are none.
-    #[must_use]
-    pub fn held_out(&self, signals: &[Prepared]) -> BTreeMap<String, Score> {
+    /// The reconstruction loss of held-out signals; nothing where there are none. Each rank computes some of them.
+    ///
+    /// # Errors
+    /// When a rank is lost.
+    pub fn held_out(
+        &self,
+        signals: &[Prepared],
+        ranks: &Communicator,
+    ) -> Result<BTreeMap<String, Score>, RankError> {
         let model = self.model.frozen();
-        let losses = signals.chunks(HELD_OUT).map(|chunk| {
+        let chunks: Vec<&[Prepared]> = signals.chunks(HELD_OUT).collect();
+        let losses = ranks.map(chunks.len(), |index| {
+            let chunk = chunks[index];
             let batch = batch(&model, chunk);
             let found = model.decode(&model.encode(&batch), chunk.len());
-            (
-                f64::from(to_host(model.loss(found, &batch))[0]),
-                chunk.len(),
-            )
-        });
-        mean_of(losses)
+            // As bits: a loss need not be a number.
+            let loss = to_host(model.loss(found, &batch))[0];
+            Ok::<_, RankError>((loss.to_bits(), chunk.len()))
+        })?;
+        let losses = losses.into_iter();
+        Ok(mean_of(
+            losses.map(|(bits, n)| (f64::from(f32::from_bits(bits)), n)),
+        ))
     }
 }
 
@@ -306,23 +320,29 @@ impl VideoReconstruction {
         tokenizer
     }
 
-    /// The squared error of pixels of held-out clips; nothing where there are none.
+    /// The squared error of pixels of `count` held-out clips; nothing where there are none. Each rank computes some of them.
     ///
     /// # Errors
-    /// What `clips` says, or when a clip has another size.
-    pub fn held_out<E: From<TrainingError>>(
+    /// What `clip` says, or when a clip has another size.
+    pub fn held_out(
         &self,
-        clips: impl Iterator<Item = Result<Option<Signal>, E>>,
-    ) -> Result<BTreeMap<String, Score>, E> {
+        count: usize,
+        clip: impl Fn(usize) -> Result<Option<Signal>, TrainingError>,
+        ranks: &Communicator,
+    ) -> Result<BTreeMap<String, Score>, TrainingError> {
         let tokenizer = self.tokenizer();
-        let mut losses = Vec::new();
-        for clip in clips {
-            if let Some(clip) = clip? {
-                let trained = tokenizer.train(&[clip]).map_err(TrainingError::from)?;
-                losses.push((f64::from(trained.loss.into_scalar::<f32>()), 1));
-            }
-        }
-        Ok(mean_of(losses.into_iter()))
+        let losses = ranks.map(count, |index| {
+            let Some(clip) = clip(index)? else {
+                return Ok(None);
+            };
+            let trained = tokenizer.train(&[clip])?;
+            // As bits: a loss need not be a number.
+            Ok::<_, TrainingError>(Some(trained.loss.into_scalar::<f32>().to_bits()))
+        })?;
+        let losses = losses.into_iter().flatten();
+        Ok(mean_of(
+            losses.map(|bits| (f64::from(f32::from_bits(bits)), 1)),
+        ))
     }
 }
 
@@ -399,6 +419,7 @@ mod tests {
     use crate::flow::Flow;
     use crate::tokenizer::video::testing::small;
     use crate::tokenizer::vq::VqSettings;
+    use crate::training::Ranks;
     use crate::training::fit::{Event, Intervals, fit};
     use ndarray::{ArrayD, IxDyn};
 
@@ -491,6 +512,50 @@ mod tests {
                 step(&mut resumed, &data);
             }
             assert!(bytes(&resumed) == bytes(&whole));
+        }
+    }
+
+    /// What `work` gives on rank 0 of `size`, once all are found to have it.
+    fn on_ranks(size: usize, work: impl Fn(Ranks) -> Vec<u8> + Sync) -> Vec<u8> {
+        let mut all = std::thread::scope(|scope| {
+            let work = &work;
+            let ranks = Communicator::threads(size).into_iter();
+            let ranks = ranks.map(|rank| Ranks::new(rank, Reduction::Ordered));
+            let threads: Vec<_> = ranks
+                .map(|ranks| scope.spawn(move || work(ranks)))
+                .collect();
+            let ended = threads.into_iter().map(|thread| thread.join().unwrap());
+            ended.collect::<Vec<_>>()
+        });
+        let first = all.swap_remove(0);
+        assert!(all.iter().all(|other| *other == first), "{size} ranks");
+        first
+    }
+
+    /// Codes follow the latents of all ranks, and dead ones are replaced from them.
+    #[test]
+    fn in_the_order_of_samples_any_number_of_ranks_trains_a_tokenizer_to_the_same_bytes() {
+        let data = data();
+        let settings = TokenizerTraining {
+            batch: 12,
+            ..settings(6, 1)
+        };
+        let train = |mut trainer: Trainer<VqReconstruction>| {
+            for _ in 0..6 {
+                step(&mut trainer, &data);
+            }
+            let ranks = trainer.ranks().communicator().clone();
+            let held_out = trainer.objective().held_out(&data, &ranks).unwrap();
+            let mut bytes = bytes(&trainer);
+            bytes.extend(held_out["reconstruction"].loss.to_bits().to_le_bytes());
+            bytes
+        };
+        let expected = train(trainer(&settings));
+        for size in 1..=4 {
+            let found = on_ranks(size, |ranks| {
+                train(trainer(&settings).shared(ranks, 1).unwrap())
+            });
+            assert!(found == expected, "{size} ranks");
         }
     }
 
@@ -645,12 +710,12 @@ mod tests {
     }
 
     #[test]
-    fn a_video_tokenizer_learns_and_resumes_to_the_same_bytes() {
+    fn a_video_tokenizer_learns_and_resumes_to_the_same_bytes_on_any_number_of_ranks() {
         let start = || {
             let settings = TokenizerTraining {
                 learning_rate: 3e-3,
                 batch: 2,
-                ..settings(8, 0)
+                ..settings(8, 1)
             };
             Trainer::video(small([4, 16, 16], [4, 4], &[4, 3], 2), &settings).unwrap()
         };
@@ -687,6 +752,14 @@ mod tests {
             step(&mut resumed);
         }
         assert!(bytes(&resumed) == bytes(&whole));
+        let found = on_ranks(2, |ranks| {
+            let mut trainer = start().shared(ranks, 1).unwrap();
+            for _ in 0..8 {
+                step(&mut trainer);
+            }
+            bytes(&trainer)
+        });
+        assert!(found == bytes(&whole));
     }
 
     #[test]

@@ -6,12 +6,13 @@ use super::mixture::Mixture;
 use super::signals::extract;
 use super::tokenizer::{Epochs, TokenizerTraining, mirrored};
 use super::tokenizer_scores::{Baselines, Example, Scores, score};
+use super::trainer::ranks::Ranks;
 use super::trainer::{HeldOut, Trainer, TrainingError};
 use super::video_kmeans::VideoKMeans;
 use super::{Event, Flow};
 use crate::clip::Signal;
 use crate::clip::source::ClipSource;
-use crate::engine::{Compute, Initialise, Parameters};
+use crate::engine::{Communicator, Compute, Initialise, Parameters};
 use crate::modality::declared::Normalize;
 use crate::modality::{self, ClipFormat, Modality, Shape};
 use crate::model::Tokenizers;
@@ -61,6 +62,8 @@ pub struct TokenizerFit<'a> {
     pub kmeans: bool,
     /// Where it trains.
     pub compute: &'a Compute,
+    /// Who trains it together. Rank 0 alone scores it.
+    pub ranks: Communicator,
     /// Of initial weights, order and codes.
     pub seed: u64,
     /// A checkpoint to continue from.
@@ -105,7 +108,7 @@ impl TokenizerFit<'_> {
     /// # Errors
     /// When no clip has the modality, the tokenizer does not take it, a clip cannot be read, the loss is not finite, or
     /// `callback` stops it.
-    pub fn run<E: From<TrainingError>>(
+    pub fn run<E: From<TrainingError> + std::fmt::Display>(
         &self,
         callback: &mut Callback<'_, E>,
     ) -> Result<FittedTokenizer, E> {
@@ -116,7 +119,7 @@ impl TokenizerFit<'_> {
         }
     }
 
-    fn vq<E: From<TrainingError>>(
+    fn vq<E: From<TrainingError> + std::fmt::Display>(
         &self,
         modality: &dyn Modality,
         sizes: &VqSettings,
@@ -146,8 +149,8 @@ impl TokenizerFit<'_> {
             held_out = prepare(self.modality, &model, &normaliser, &signals)
                 .map_err(TrainingError::from)?;
         }
-        let mut trainer = Trainer::vq(model, &self.training, self.seed)?;
-        self.resume(&mut trainer)?;
+        let trainer = Trainer::vq(model, &self.training, self.seed)?;
+        let mut trainer = self.together(trainer)?;
         let epochs = Epochs::of(&trainer, self.seed);
         let mut epochs = self.mixture.epochs(epochs, &sets)?;
         let best = fit(
@@ -157,15 +160,17 @@ impl TokenizerFit<'_> {
                 let chosen = epochs.choose(step, micro, prepared.len())?;
                 Ok(chosen.into_iter().map(|i| prepared[i].clone()).collect())
             },
-            |objective| Ok(objective.held_out(&held_out)),
+            |objective| {
+                let losses = objective.held_out(&held_out, &self.ranks);
+                Ok(losses.map_err(TrainingError::from)?)
+            },
             callback,
         )?;
         let tokenizer = VqTokenizer::new(self.modality, shape, normaliser.clone(), trainer.model())
             .map_err(TrainingError::from)?;
         drop(trainer);
         let patches = tokenizer.model().patches();
-        let kmeans = self
-            .kmeans
+        let kmeans = (self.kmeans && self.ranks.is_root())
             .then(|| KMeans::fit(patches, &prepared, sizes.codebook, self.seed))
             .flatten();
         let project = |signal: &Signal| {
@@ -190,7 +195,7 @@ impl TokenizerFit<'_> {
         })
     }
 
-    fn video<E: From<TrainingError>>(
+    fn video<E: From<TrainingError> + std::fmt::Display>(
         &self,
         modality: &dyn Modality,
         sizes: &VideoSettings,
@@ -231,8 +236,7 @@ impl TokenizerFit<'_> {
             model.calibrate(&first).map_err(TrainingError::from)?;
         }
         let validation = self.validation();
-        let mut trainer = Trainer::video(model, &self.training)?;
-        self.resume(&mut trainer)?;
+        let mut trainer = self.together(Trainer::video(model, &self.training)?)?;
         let epochs = Epochs::of(&trainer, self.seed);
         let mut epochs = self.mixture.epochs(epochs, &sets)?;
         let best = fit(
@@ -246,9 +250,10 @@ impl TokenizerFit<'_> {
                 Ok(clips)
             },
             |objective| {
-                let clips = validation.into_iter();
-                let clips = clips.flat_map(|(source, n)| (0..n).map(move |i| one(source, i)));
-                Ok(objective.held_out(clips)?)
+                let Some((source, count)) = validation else {
+                    return Ok(BTreeMap::new());
+                };
+                Ok(objective.held_out(count, |index| one(source, index), &self.ranks)?)
             },
             callback,
         )?;
@@ -264,7 +269,7 @@ impl TokenizerFit<'_> {
                     .for_each(|(mean, value)| *mean += f64::from(*value));
             }
         }
-        let kmeans = if self.kmeans {
+        let kmeans = if self.kmeans && self.ranks.is_root() {
             VideoKMeans::fit(&tokenizer, having.len(), self.seed, read)?
         } else {
             None
@@ -288,11 +293,17 @@ impl TokenizerFit<'_> {
         })
     }
 
-    fn resume<O: super::Objective>(&self, trainer: &mut Trainer<O>) -> Result<(), TrainingError> {
-        match &self.resume {
-            Some(checkpoint) => trainer.resume(checkpoint),
-            None => Ok(()),
+    /// Shared with the other ranks, and from where it was.
+    fn together<O: super::Objective>(
+        &self,
+        trainer: Trainer<O>,
+    ) -> Result<Trainer<O>, TrainingError> {
+        let ranks = Ranks::new(self.ranks.clone(), self.training.reduction);
+        let mut trainer = trainer.shared(ranks, self.training.micro_batch)?;
+        if let Some(checkpoint) = &self.resume {
+            trainer.resume(checkpoint)?;
         }
+        Ok(trainer)
     }
 
     /// The clips whose loss is computed while it trains, where that is asked for.
@@ -303,7 +314,7 @@ impl TokenizerFit<'_> {
     }
 
     /// All training signals of the modality, for hands also those of the other hand in a mirror, and how many each data set has.
-    fn signals<E: From<TrainingError>>(
+    fn signals<E: From<TrainingError> + std::fmt::Display>(
         &self,
         modality: &dyn Modality,
         callback: &mut Callback<'_, E>,
@@ -349,14 +360,14 @@ impl TokenizerFit<'_> {
         Normaliser::fit(signals.iter(), width)
     }
 
-    fn score<E: From<TrainingError>>(
+    fn score<E: From<TrainingError> + std::fmt::Display>(
         &self,
         modality: &dyn Modality,
         tokenizer: &dyn Tokenizer,
         baselines: &Baselines<'_>,
         callback: &mut Callback<'_, E>,
     ) -> Result<(Scores, Vec<Example>), E> {
-        let Some(source) = self.held_out else {
+        let Some(source) = self.held_out.filter(|_| self.ranks.is_root()) else {
             return Ok(Default::default());
         };
         let most = self.held_out_clips.min(source.len());
@@ -479,6 +490,7 @@ impl Tokenizers {
                 },
                 kmeans: false,
                 compute: &options.compute,
+                ranks: Communicator::alone(),
                 seed: options.seed,
                 resume: None,
             };

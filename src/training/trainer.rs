@@ -3,12 +3,15 @@
 //! What differs is an [`Objective`]: the module, its loss on a micro-batch, and what a step changes that no gradient does
 //! (codebooks). Everything a step does is a function of the seed, the step and the state.
 
+pub mod ranks;
+
+use self::ranks::{Ranks, ShareError, Told};
 use super::optimizer::{AdamW, AdamWSettings, NotFinite};
 use super::schedule::{Schedule, ScheduleError};
 use super::settings::{Keep, SettingsError};
 use super::source::DataError;
 use super::validation::Score;
-use crate::engine::{EngineError, Gradients, Parameters, Weights};
+use crate::engine::{EngineError, Gradients, Parameters, RankError, Weights};
 use crate::formats::ReadError;
 use crate::masking::MaskingError;
 use crate::mget::SpecError;
@@ -24,8 +27,8 @@ pub trait Objective {
     type Module: Parameters;
     /// What one forward pass takes.
     type Batch;
-    /// What a micro-batch leaves for [`Objective::finish_step`].
-    type Trace;
+    /// What a micro-batch leaves for [`Objective::finish_step`]; ranks tell each other theirs.
+    type Trace: Told;
 
     /// The module in training.
     fn module(&self) -> &Self::Module;
@@ -73,6 +76,7 @@ pub struct Trainer<O> {
     optimizer: AdamW,
     schedule: Schedule,
     micro_batches: Vec<usize>,
+    ranks: Ranks,
     keep: Keep,
     best: Option<Best>,
     progress: Progress,
@@ -171,6 +175,10 @@ pub enum TrainingError {
     NoData,
     #[error("stopped by its callback")]
     Stopped,
+    #[error(transparent)]
+    Rank(#[from] RankError),
+    #[error(transparent)]
+    Share(#[from] ShareError),
     #[error("the clips have no modality `{0}`")]
     UnknownModality(String),
     #[error("clip `{clip}`: {reason}")]
@@ -204,7 +212,7 @@ pub enum TrainingError {
 }
 
 impl<O: Objective> Trainer<O> {
-    /// Starts to train. `micro_batches` are the samples of each forward pass of a step.
+    /// Starts to train, alone. `micro_batches` are the samples of each forward pass of a step.
     #[must_use]
     pub fn start(
         mut objective: O,
@@ -220,32 +228,55 @@ impl<O: Objective> Trainer<O> {
             optimizer,
             schedule,
             micro_batches,
+            ranks: Ranks::default(),
             keep,
             best: None,
             progress: Progress::default(),
         }
     }
 
-    /// Takes one step; `next(i)` gives its micro-batch `i`.
+    /// Shares every step with other ranks, `micro_batch` samples in a forward pass (0: whatever suits them). All of them must be
+    /// here with the same module, schedule and batch.
     ///
     /// # Errors
-    /// When a batch cannot be had, or loss or gradient are not finite. Model and optimizer are as before then.
-    pub fn step<E: From<TrainingError>>(
+    /// When they cannot share it evenly.
+    pub fn shared(mut self, ranks: Ranks, micro_batch: usize) -> Result<Self, ShareError> {
+        let batch = self.micro_batches.iter().sum();
+        self.micro_batches = ranks.micro_batches(batch, micro_batch)?;
+        self.ranks = ranks;
+        Ok(self)
+    }
+
+    /// Takes one step; `next(i)` gives its micro-batch `i`, of those that are this rank's ([`Ranks::own`]).
+    ///
+    /// # Errors
+    /// When a batch cannot be had, or loss or gradient are not finite, here or on another rank. Model and optimizer are as before
+    /// then.
+    pub fn step<E: From<TrainingError> + std::fmt::Display>(
         &mut self,
         mut next: impl FnMut(usize) -> Result<O::Batch, E>,
     ) -> Result<StepReport, E> {
         let mut progress = self.progress;
         progress.step += 1;
-        let mut sum: Option<Gradients> = None;
         let mut loss = 0.0;
         let mut parts: Vec<(String, f64, f64)> = Vec::new();
         let mut traces = Vec::new();
         let samples: usize = self.micro_batches.iter().sum();
-        for (index, size) in self.micro_batches.iter().enumerate() {
+        let shares: Vec<f64> = self
+            .micro_batches
+            .iter()
+            .map(|n| *n as f64 / samples as f64)
+            .collect();
+        let objective = &self.objective;
+        let micro_step = |index: usize| -> Result<_, E> {
             let batch = next(index)?;
             // The loss of a step is the mean over its micro-batches, as in the reference.
-            let share = *size as f64 / samples as f64;
-            let micro = self.objective.micro_step(&batch, share)?;
+            let micro = objective.micro_step(&batch, shares[index])?;
+            Ok(micro)
+        };
+        let (step, model) = (self.progress.step, objective.module());
+        let (micros, sum) = self.ranks.sum(step, shares.len(), model, micro_step)?;
+        for (micro, share) in micros.into_iter().zip(&shares) {
             progress.samples += micro.used.samples;
             progress.input_tokens += micro.used.input_tokens;
             progress.target_tokens += micro.used.target_tokens;
@@ -256,23 +287,15 @@ impl<O: Objective> Trainer<O> {
             loss += micro.loss * share;
             add(&mut parts, micro.parts);
             traces.push(micro.trace);
-            // A batch that asks for nothing has no gradient.
-            if let Some(gradients) = micro.gradients {
-                sum = Some(match sum {
-                    Some(sum) => sum.plus(gradients),
-                    None => gradients,
-                });
-            }
         }
         let learning_rate = self.schedule.rate(self.progress.step);
-        // The one place where the gradient of a whole step is at hand: shares are of the step's samples, so that gradients of
-        // several processes are to be added here, and nothing else of a step knows how many there are.
         let mut gradients = sum.unwrap_or_default();
         gradients.complete(self.objective.module());
         let gradient_norm = self
             .optimizer
             .step(self.objective.module_mut(), gradients, learning_rate)
             .map_err(TrainingError::from)?;
+        self.ranks.note(gradient_norm);
         let further = self.objective.finish_step(traces, self.progress.step);
         self.progress = progress;
         let parts = parts.into_iter().map(|(name, mean, _)| (name, mean));
@@ -337,7 +360,13 @@ impl<O: Objective> Trainer<O> {
         self.schedule.total()
     }
 
-    /// Samples of each forward pass of a step.
+    /// The ranks it trains on.
+    #[must_use]
+    pub fn ranks(&self) -> &Ranks {
+        &self.ranks
+    }
+
+    /// Samples of each forward pass of a step, over all ranks.
     #[must_use]
     pub fn micro_batches(&self) -> &[usize] {
         &self.micro_batches

@@ -2,7 +2,7 @@
 
 use super::loader::pack;
 use super::source::{DataError, TokenSource};
-use crate::engine::Parameters;
+use crate::engine::{Communicator, Parameters, RankError};
 use crate::masking::Masking;
 use crate::mget::{Batch, Loss, Mget, MgetSpec};
 use crate::random::stream;
@@ -69,17 +69,28 @@ impl Validation {
         self.batches.is_empty()
     }
 
-    /// The mean loss per modality that was asked for.
-    #[must_use]
-    pub fn run(&self, model: &Mget) -> BTreeMap<String, Score> {
+    /// The mean loss per modality that was asked for; each rank computes some of the batches.
+    ///
+    /// # Errors
+    /// When a rank is lost.
+    pub fn run(
+        &self,
+        model: &Mget,
+        ranks: &Communicator,
+    ) -> Result<BTreeMap<String, Score>, RankError> {
         let model = model.frozen();
-        let losses = self.batches.iter().map(|batch| {
-            let values = model.losses(batch, Loss::Mod).values();
+        let losses = ranks.map(self.batches.len(), |index| {
+            let values = model.losses(&self.batches[index], Loss::Mod).values();
             let sums = values.modalities.into_iter();
-            sums.map(|loss| loss.map(|(mean, tokens)| (mean * tokens as f64, tokens)))
-                .collect()
-        });
-        self.mean(losses)
+            // As bits: a loss need not be a number.
+            let sum = |(mean, tokens): (f64, usize)| ((mean * tokens as f64).to_bits(), tokens);
+            Ok::<Vec<Option<(u64, usize)>>, RankError>(sums.map(|loss| loss.map(sum)).collect())
+        })?;
+        let number = |(bits, tokens): (u64, usize)| (f64::from_bits(bits), tokens);
+        Ok(self.mean(losses.into_iter().map(|batch| {
+            let numbers = batch.into_iter().map(|loss| loss.map(number));
+            numbers.collect()
+        })))
     }
 
     /// The loss of always answering with the token frequencies of the training data.

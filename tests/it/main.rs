@@ -21,6 +21,9 @@ mod odd_videos;
 mod paper_runs;
 mod parity;
 mod pickles;
+mod ranks;
+#[cfg(feature = "mpi")]
+mod ranks_mpi;
 mod readers_bad;
 mod reconstruct_command;
 mod reconstruction;

@@ -1,7 +1,7 @@
 //! Training: a resumed run has the bytes of an uninterrupted one, whatever the loader does; a small model learns.
 #![allow(clippy::unwrap_used)] // a test that panics is a test that fails
 
-use reviv::engine::{Compute, Initialise, Parameters, Weights};
+use reviv::engine::{Communicator, Compute, Initialise, Parameters, Weights};
 use reviv::masking::{Masking, MaskingSettings, TokenBudget};
 use reviv::mget::{Mget, MgetSpec, ModalitySpec, Positions, Size};
 use reviv::random::stream;
@@ -13,7 +13,7 @@ use reviv::training::{
 use std::ops::Range;
 use std::sync::Arc;
 
-fn spec() -> MgetSpec {
+pub fn spec() -> MgetSpec {
     MgetSpec {
         size: Size {
             width: 24,
@@ -32,7 +32,7 @@ fn spec() -> MgetSpec {
 }
 
 /// Clips whose camera counts up from a random start, whose gaze says the same in other words, and whose video is that bright.
-fn clips(count: u64, seed: u64) -> InMemory {
+pub fn clips(count: u64, seed: u64) -> InMemory {
     use rand::RngExt;
     let samples = (0..count)
         .map(|clip| {
@@ -60,7 +60,7 @@ fn clips(count: u64, seed: u64) -> InMemory {
     }
 }
 
-struct Setup {
+pub struct Setup {
     settings: TrainingSettings,
     source: Arc<dyn TokenSource>,
     steps: u64,
@@ -82,7 +82,7 @@ impl Setup {
         }
     }
 
-    fn masking() -> Masking {
+    pub fn masking() -> Masking {
         let settings = MaskingSettings {
             input_tokens: TokenBudget::Fixed(8),
             target_tokens: TokenBudget::Fixed(8),
@@ -125,6 +125,7 @@ impl Setup {
         let mut loader = Loader::start(
             &self.feed(),
             steps.start..self.steps,
+            &(0..self.settings.micro_batches().len()).collect::<Vec<_>>(),
             self.settings.loader_threads,
         );
         let mut next = |_| Ok::<_, TrainingError>(loader.next(&|| 0.0)?);
@@ -211,7 +212,9 @@ fn a_small_model_beats_the_unigram_baseline_on_every_modality() {
     let validation = Validation::new(&spec(), &Setup::masking(), &held_out, 48, 16, 0).unwrap();
     let unigram = Unigram::fit(&spec(), std::slice::from_ref(&setup.source), &[64], 64).unwrap();
     let baseline = validation.baseline(&unigram);
-    let scores = validation.run(trainer.model());
+    let scores = validation
+        .run(trainer.model(), &Communicator::alone())
+        .unwrap();
     assert_eq!(scores.keys().collect::<Vec<_>>(), ["camera", "gaze"]);
     for (name, score) in scores {
         assert_eq!(score.tokens, baseline[&name].tokens);

@@ -3,6 +3,7 @@
 use super::super::device::compute;
 use super::super::evaluate::write_text;
 use super::{TrainMgetSettings, spec};
+use crate::engine::Communicator;
 use crate::experiment::{Code, InputArtifact, StageContext, StageError, TokenFacts};
 use crate::masking::{Masking, PIXELS};
 use crate::mget::MgetSpec;
@@ -75,6 +76,8 @@ pub(super) fn run(
         .collect();
     let held_out = open(first, "validation")?;
     let compute = compute(settings.device, settings.precision, context)?;
+    let ranks = Communicator::world();
+    let root = ranks.is_root();
     let watch = Stopwatch::start();
     let (input, target) = masking.nominal_tokens();
     let mut record = Record {
@@ -93,35 +96,34 @@ pub(super) fn run(
         held_out: &held_out,
         settings: &settings.training,
         compute: &compute,
+        ranks,
         seed: context.seed(),
         resume: checkpoint::latest(context.checkpoints()).map(|(_, path)| path),
         clock: &|| watch.seconds(),
     };
-    let fitted =
-        fit.run(&mut |event| record.heard(event, context))
-            .map_err(|failure| match failure {
-                Failure::Training(error) => input_error(error),
-                Failure::Stage(error) => error,
-            })?;
+    let fitted = fit
+        .run(&mut |event| match root {
+            true => record.heard(event, context),
+            false => Ok(Flow::Continue),
+        })
+        .map_err(|failure| match failure {
+            Failure::Training(error) => input_error(error),
+            Failure::Stage(error) => error,
+        })?;
+    // Rank 0 alone writes.
+    if !root {
+        return Ok(Value::Null);
+    }
     publish(&fitted, first, &settings.training, context)
 }
 
 /// Why training ended early.
+#[derive(Debug, thiserror::Error)]
 enum Failure {
-    Training(TrainingError),
-    Stage(StageError),
-}
-
-impl From<TrainingError> for Failure {
-    fn from(error: TrainingError) -> Self {
-        Self::Training(error)
-    }
-}
-
-impl From<StageError> for Failure {
-    fn from(error: StageError) -> Self {
-        Self::Stage(error)
-    }
+    #[error(transparent)]
+    Training(#[from] TrainingError),
+    #[error(transparent)]
+    Stage(#[from] StageError),
 }
 
 /// What a manifest may say; what it says wrongly is no less there.

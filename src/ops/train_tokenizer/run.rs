@@ -6,7 +6,7 @@ use super::super::modality_entry::DEFAULTS;
 use super::{TrainTokenizerSettings, picture, report, tokens};
 use crate::clip::joined::Joined;
 use crate::clip::source::ClipSource;
-use crate::engine::Precision;
+use crate::engine::{Communicator, Precision};
 use crate::experiment::{Code, StageContext, StageError};
 use crate::run::checkpoint;
 use crate::training::tokenizer_scores::Scores;
@@ -53,6 +53,8 @@ pub(super) fn run(
     let having = having.count();
     let resume = checkpoint::latest(context.checkpoints());
     let compute = compute(settings.device, Precision::F32, context)?;
+    let ranks = Communicator::world();
+    let root = ranks.is_root();
     let fit = TokenizerFit {
         modality: name,
         format: &format,
@@ -73,15 +75,23 @@ pub(super) fn run(
         mirror: settings.other_hand(),
         kmeans: settings.kmeans,
         compute: &compute,
+        ranks,
         seed: context.seed(),
         resume: resume.map(|(_, path)| path),
     };
     let fitted = fit
-        .run(&mut |event| heard(event, having, settings, context))
+        .run(&mut |event| match root {
+            true => heard(event, having, settings, context),
+            false => Ok(Flow::Continue),
+        })
         .map_err(|failure: Failure| match failure {
             Failure::Training(error) => failed(error, settings),
             Failure::Stage(error) => error,
         })?;
+    // Rank 0 alone writes.
+    if !root {
+        return Ok(Value::Null);
+    }
     if settings.keep == Keep::Best {
         context.log(&format!(
             "keeps the weights of step {}",
@@ -123,21 +133,12 @@ pub(super) fn run(
 }
 
 /// Why training ended early.
+#[derive(Debug, thiserror::Error)]
 enum Failure {
-    Training(TrainingError),
-    Stage(StageError),
-}
-
-impl From<TrainingError> for Failure {
-    fn from(error: TrainingError) -> Self {
-        Self::Training(error)
-    }
-}
-
-impl From<StageError> for Failure {
-    fn from(error: StageError) -> Self {
-        Self::Stage(error)
-    }
+    #[error(transparent)]
+    Training(#[from] TrainingError),
+    #[error(transparent)]
+    Stage(#[from] StageError),
 }
 
 /// Into the record of the run.

@@ -11,8 +11,10 @@
 //!   video. On the CPU each is one fused operation with a hand-written backward; on other back ends it is unfused of the
 //!   library's own operations. Nearest code is a search on the host; embedding is the library's select everywhere;
 //! * [`gradients`]: gradients by parameter name, their global norm;
+//! * [`communicator`]: processes that train one model together;
 //! * [`memory`]: an allocator that uses the memory of one step again in the next.
 
+pub mod communicator;
 pub mod compute;
 pub mod gradients;
 pub mod initialise;
@@ -23,6 +25,7 @@ pub mod segments;
 pub mod weights;
 
 pub use burn::tensor::{Bool, Device, Int, Tensor};
+pub use communicator::{Communicator, RankError};
 pub use compute::{Compute, DeviceChoice, DeviceKind, Precision};
 pub use gradients::Gradients;
 pub use initialise::Initialise;
