@@ -78,6 +78,9 @@ pub struct Reconstruct {
     /// The seed of the decoding
     #[arg(long, value_name = "N")]
     seed: Option<u64>,
+    /// Samples to write beside the reconstruction, with their spread
+    #[arg(long, value_name = "N")]
+    samples: Option<usize>,
     /// Change any other value: `--set stages.reconstruction.overlap=1.5`
     #[arg(long, value_name = "KEY=VALUE")]
     set: Vec<String>,
@@ -118,6 +121,7 @@ impl super::Run for Reconstruct {
             runs: &self.place.runs,
             only: None,
             shard: Shard::WHOLE,
+            check: false,
             crew: WorkerPool::alone(),
             progress: &progress,
             interrupt: &interrupt,
@@ -215,6 +219,9 @@ impl Reconstruct {
         }
         if let Some(seconds) = self.seconds {
             set.push(change("seconds", &seconds.to_string()));
+        }
+        if let Some(samples) = self.samples {
+            set.push(change("samples", &samples.to_string()));
         }
         if let Some(decoder) = self.decoder {
             set.push(change("reading.decoder", decoder.name()));

@@ -25,6 +25,10 @@ pub struct Run {
     /// Do one of N parts of a sweep; run the others beside it, on any machine that shares the disk
     #[arg(long, value_name = "I/N", default_value_t = Shard::WHOLE)]
     shard: Shard,
+    /// Read every byte of what is in the cache before it is used, and make again what is damaged; without it, only files that were
+    /// written to since they were made are read
+    #[arg(long)]
+    check: bool,
     /// Stages made at the same time [default: as many as there are cores, up to 4, as far as their planned memory fits into half
     /// of the machine's]
     #[arg(long, short, value_name = "N", value_parser = clap::value_parser!(u16).range(1..))]
@@ -101,6 +105,7 @@ impl Run {
             runs: &self.place.runs,
             only: self.only.as_deref(),
             shard: self.shard,
+            check: self.check,
             crew,
             progress: &progress,
             interrupt: &interrupt,

@@ -2,7 +2,7 @@
 
 use super::run::{RunsDir, find, interruptible, progress, tell};
 use super::terminal::{Failure, Terminal};
-use crate::run::verify::{Redo, Verdict, verify};
+use crate::run::verify::{How, Redo, Verdict, verify};
 use std::path::PathBuf;
 
 /// Re-hash a run's inputs and artifacts, redo its work from a checkpoint, and demand identical bytes
@@ -17,6 +17,9 @@ pub struct Verify {
     /// Redo everything, also long stages without a checkpoint
     #[arg(long)]
     all: bool,
+    /// Make again what is damaged or gone
+    #[arg(long)]
+    repair: bool,
     /// Write the checks as JSON to stdout
     #[arg(long)]
     json: bool,
@@ -33,7 +36,11 @@ impl super::Run for Verify {
             _ => Redo::Quick,
         };
         let interrupt = interruptible(terminal)?;
-        let checks = verify(&run, redo, &progress(terminal), &interrupt)
+        let how = How {
+            redo,
+            repair: self.repair,
+        };
+        let checks = verify(&run, how, &progress(terminal), &interrupt)
             .map_err(|error| tell(terminal, &error))?;
         if self.json {
             terminal.json(&checks);
@@ -43,14 +50,15 @@ impl super::Run for Verify {
                     Verdict::Same => "same",
                     Verdict::Changed => "CHANGED",
                     Verdict::Skipped => "skipped",
+                    Verdict::Repaired => "repaired",
+                    Verdict::Failed => "FAILED",
                 };
-                terminal.data(format_args!("{word:8}{}: {}\n", check.what, check.detail));
+                terminal.data(format_args!("{word:9}{}: {}\n", check.what, check.detail));
             }
         }
-        let changed = checks
-            .iter()
-            .filter(|check| check.verdict == Verdict::Changed)
-            .count();
+        let bad = [Verdict::Changed, Verdict::Failed];
+        let damaged = checks.iter().filter(|check| bad.contains(&check.verdict));
+        let changed = damaged.count();
         if changed == 0 {
             return Ok(());
         }
@@ -58,6 +66,9 @@ impl super::Run for Verify {
             "error[E0602]: {changed} of {} checks failed\n",
             checks.len()
         ));
+        if !self.repair {
+            terminal.note("hint: `--repair` makes damaged artifacts again\n");
+        }
         Err(Failure::Ended(1))
     }
 }

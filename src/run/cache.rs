@@ -3,20 +3,22 @@
 //! An artifact's [`Key`] ([`crate::experiment::Graph::keys`]) is the blake3 hash of the op, the op's version, the resolved
 //! settings, the seed, the bytes of the files it reads and the keys of the input artifacts: everything that decides its bytes. The directory
 //! `cache/ab/abcdef.../` is the artifact; it appears in one step, complete, with a [`Manifest`] that lists its files. What
-//! has no manifest, or lost a file, is not there.
+//! has no manifest, lost a file, or has a file that was written to since and now has other bytes, is not there.
 
 use super::environment;
 use super::error::{AtPath, RunError};
 use super::files;
 use super::interrupt::Interrupt;
 use super::lock::Lock;
+use super::stamps::Stamps;
 use crate::experiment::ArtifactKey;
 
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fmt;
 use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 /// The name of the manifest inside an artifact.
 pub const MANIFEST: &str = "manifest.json";
@@ -140,7 +142,12 @@ pub enum Entry {
 #[derive(Debug, Clone)]
 pub struct Cache {
     root: PathBuf,
+    /// Every byte is read before an artifact counts as whole; those that were read lately do.
+    strict: Option<Arc<Mutex<BTreeSet<Key>>>>,
 }
+
+/// What lies beside an artifact and says when its files were seen to be whole.
+const SEEN: &str = "seen.json";
 
 impl Cache {
     /// The cache of a directory of runs.
@@ -149,7 +156,19 @@ impl Cache {
     }
 
     pub fn new(root: impl Into<PathBuf>) -> Self {
-        Self { root: root.into() }
+        Self {
+            root: root.into(),
+            strict: None,
+        }
+    }
+
+    /// The same cache, which reads every byte of an artifact once before it counts as whole.
+    #[must_use]
+    pub fn strict(self) -> Self {
+        Self {
+            strict: Some(Arc::default()),
+            ..self
+        }
     }
 
     pub fn root(&self) -> &Path {
@@ -178,7 +197,8 @@ impl Cache {
         matches!(self.look(key), Entry::Whole(_))
     }
 
-    /// Looks at what is there: the manifest, and every file's presence and size (not its bytes: see [`Cache::rehash`]).
+    /// Looks at what is there: the manifest, every file's presence and size, and the bytes of files that were written to since they
+    /// were seen to be whole. A strict cache reads all bytes.
     pub fn look(&self, key: &Key) -> Entry {
         let path = self.path(key);
         if std::fs::symlink_metadata(&path).is_err() {
@@ -204,7 +224,45 @@ impl Cache {
                 Err(error) => return Entry::Damaged(format!("`{name}`: {error}")),
             }
         }
-        Entry::Whole(Box::new(manifest))
+        match self.bytes_hold(key, &manifest) {
+            Ok(()) => Entry::Whole(Box::new(manifest)),
+            Err(why) => Entry::Damaged(why),
+        }
+    }
+
+    fn bytes_hold(&self, key: &Key, manifest: &Manifest) -> Result<(), String> {
+        let path = self.path(key);
+        let read = || self.strict.as_ref().map(|read| lock(read).contains(key));
+        let known: Option<Stamps> = match read() {
+            Some(true) => return Ok(()),
+            // As if nothing had ever been seen.
+            Some(false) => Some(Stamps::default()),
+            None => files::read_json(&self.beside(key, SEEN)).ok(),
+        };
+        // An artifact of which nobody knows when it was seen is believed, as its size is right.
+        let Some(known) = known else {
+            return Ok(());
+        };
+        let now = Stamps::of(&path, manifest.files.keys()).map_err(|error| error.to_string())?;
+        let mut any = false;
+        for name in now.changed(&known) {
+            any = true;
+            let Some(file) = manifest.files.get(name) else {
+                continue;
+            };
+            let (hash, _) = files::hash(&path.join(name)).map_err(|error| error.to_string())?;
+            if hash.to_hex().as_str() != file.blake3 {
+                return Err(format!("`{name}` has other bytes than when it was made"));
+            }
+        }
+        if any {
+            // On a disk that cannot be written to, the next look reads them again.
+            let _ = files::write_json(&self.beside(key, SEEN), &now);
+        }
+        if let Some(read) = &self.strict {
+            lock(read).insert(*key);
+        }
+        Ok(())
     }
 
     /// Reads every byte of an artifact again and compares with its manifest.
@@ -285,7 +343,12 @@ impl Cache {
         let place = self.path(key);
         self.set_aside(key)?;
         files::publish_directory(&making, &place)?;
+        let seen = Stamps::of(&place, manifest.files.keys())?;
+        files::write_json(&self.beside(key, SEEN), &seen)?;
         files::write_json(&self.beside(key, "made.json"), made)?;
+        if let Some(read) = &self.strict {
+            lock(read).insert(*key);
+        }
         Ok(manifest)
     }
 
@@ -305,6 +368,10 @@ impl Cache {
         if std::fs::symlink_metadata(&path).is_err() {
             return Ok(());
         }
+        if let Some(read) = &self.strict {
+            lock(read).remove(key);
+        }
+        files::remove(&self.beside(key, SEEN))?;
         let aside = self.beside(key, "damaged");
         files::remove(&aside)?;
         std::fs::rename(&path, &aside).at("moving", &path)
@@ -350,12 +417,17 @@ impl Cache {
     }
 }
 
-/// One name in the cache: an artifact (no extension), or what lies beside it (`lock`, `making`, `made.json`, `damaged`).
+/// One name in the cache: an artifact (no extension), or what lies beside it (`lock`, `making`, `made.json`, `seen.json`,
+/// `damaged`).
 #[derive(Debug)]
 pub struct Leaf {
     pub key: Key,
     pub extension: String,
     pub path: PathBuf,
+}
+
+fn lock(read: &Mutex<BTreeSet<Key>>) -> MutexGuard<'_, BTreeSet<Key>> {
+    read.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 fn read_sorted(directory: &Path) -> Result<Vec<PathBuf>, RunError> {
@@ -426,6 +498,12 @@ mod tests {
         let file = cache.path(&key).join("part/a.bin");
         std::fs::write(&file, b"abd").unwrap();
         assert_eq!(cache.rehash(&key).unwrap_err().code(), "E0602");
+        let Entry::Damaged(why) = cache.look(&key) else {
+            panic!("as many bytes, but others");
+        };
+        assert!(why.contains("part/a.bin"), "{why}");
+        std::fs::write(&file, b"abc").unwrap();
+        assert!(cache.contains(&key), "the bytes are back");
         std::fs::write(&file, b"ab").unwrap();
         assert!(matches!(cache.look(&key), Entry::Damaged(_)));
         std::fs::remove_file(cache.path(&key).join(MANIFEST)).unwrap();
@@ -433,6 +511,27 @@ mod tests {
 
         make(&cache, &key);
         assert!(cache.contains(&key));
+    }
+
+    /// Bytes that went bad without the file system's knowledge are found by who reads them all.
+    #[test]
+    fn a_strict_cache_reads_what_the_stamps_do_not_tell() {
+        let dir = tempfile::tempdir().unwrap();
+        let cache = Cache::new(dir.path());
+        let key = key("a");
+        make(&cache, &key);
+        let file = cache.path(&key).join("part/a.bin");
+        std::fs::write(&file, b"abd").unwrap();
+        // As if the stamps were of the bytes that are there now.
+        let now = Stamps::of(&cache.path(&key), [&"part/a.bin".to_owned()]).unwrap();
+        files::write_json(&cache.beside(&key, SEEN), &now).unwrap();
+        assert!(cache.contains(&key));
+        assert!(!cache.clone().strict().contains(&key));
+        std::fs::write(&file, b"abc").unwrap();
+        let strict = cache.strict();
+        assert!(strict.contains(&key));
+        std::fs::write(&file, b"abd").unwrap();
+        assert!(strict.contains(&key), "once in a process is enough");
     }
 
     #[test]

@@ -43,7 +43,10 @@ fn artifacts(schedule: &Schedule, cache: &Cache) -> BTreeMap<String, PathBuf> {
 
 /// Runs an experiment. An error means that the run could not be begun; what fails later is in the [`Outcome`].
 pub fn execute(job: &Job<'_>) -> Result<Outcome, RunError> {
-    let cache = Cache::of(job.runs);
+    let mut cache = Cache::of(job.runs);
+    if job.check {
+        cache = cache.strict();
+    }
     let prints = Fingerprints::remembered(&cache).watched(job.progress, job.interrupt);
     let schedule = Schedule::of(job.experiment, prints)?;
     let targets = schedule.targets(job.only, job.shard)?;

@@ -62,7 +62,8 @@ pub fn prune(runs: &Path, options: Options) -> Result<Pruned, RunError> {
     let (referred, checkpoints) = referred(runs)?;
     for leaf in cache.entries()? {
         let whole = leaf.extension.is_empty();
-        if (whole || leaf.extension == "made.json") && referred.contains(&leaf.key) {
+        let belongs = ["made.json", "seen.json"].contains(&leaf.extension.as_str());
+        if (whole || belongs) && referred.contains(&leaf.key) {
             pruned.kept += usize::from(whole);
             continue;
         }
@@ -88,9 +89,16 @@ pub fn prune(runs: &Path, options: Options) -> Result<Pruned, RunError> {
 
 impl Pruned {
     fn take(&mut self, path: &Path, options: Options) -> Result<(), RunError> {
-        self.bytes += match std::fs::symlink_metadata(path).at("reading", path)? {
-            meta if meta.is_dir() => files::size_below(path)?,
-            meta => meta.len(),
+        let meta = match std::fs::symlink_metadata(path) {
+            Ok(meta) => meta,
+            // Whoever made it has finished since it was listed.
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => return Ok(()),
+            Err(error) => return Err(error).at("reading", path),
+        };
+        self.bytes += if meta.is_dir() {
+            files::size_below(path)?
+        } else {
+            meta.len()
         };
         self.paths.push(path.to_path_buf());
         if options.dry_run {

@@ -15,6 +15,8 @@ pub struct Job<'a> {
     /// Only this stage, and what it needs.
     pub only: Option<&'a str>,
     pub shard: Shard,
+    /// Read every byte of what is in the cache before it is used.
+    pub check: bool,
     /// How many stages at once.
     pub crew: WorkerPool,
     pub progress: &'a Progress,

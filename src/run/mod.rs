@@ -30,6 +30,7 @@ pub mod record;
 pub mod report;
 pub mod schedule;
 pub mod stage;
+mod stamps;
 pub mod tensorboard;
 pub mod verify;
 pub mod worker_pool;

@@ -3,7 +3,7 @@
 //! Arms and seeds that agree on a stage share it, because they agree on its key. `plan.json` is a [`Schedule`]: it is enough
 //! to do any of the work again without the YAML that asked for it.
 
-use super::cache::{Cache, Key};
+use super::cache::{Cache, Entry, Key};
 use super::error::{AtPath, RunError};
 use super::inputs::Fingerprints;
 use super::record::Shard;
@@ -190,13 +190,18 @@ impl Schedule {
             .collect())
     }
 
-    /// The work that `targets` need and the cache does not have, inputs first.
+    /// The work that `targets` need and the cache does not have, and what lies damaged in it, inputs first.
     pub fn to_do(&self, targets: &BTreeSet<Key>, cache: &Cache) -> Vec<&Task> {
         let mut missing: BTreeSet<Key> = BTreeSet::new();
         let mut needed: BTreeSet<Key> = targets.clone();
         // Inputs come first in `works`, so that walking backwards meets every reader before what it reads.
         for work in self.works.iter().rev() {
-            if needed.contains(&work.key) && !cache.contains(&work.key) {
+            let is_missing = match cache.look(&work.key) {
+                Entry::Whole(_) => false,
+                Entry::Absent => needed.contains(&work.key),
+                Entry::Damaged(_) => true,
+            };
+            if is_missing {
                 missing.insert(work.key);
                 needed.extend(work.input_keys());
             }

@@ -1,7 +1,7 @@
 //! Verifies a run: its inputs and artifacts still have the bytes they had, and doing its work again, from a checkpoint where
 //! there is one, gives the same bytes.
 
-use super::cache::{Cache, Entry, MANIFEST};
+use super::cache::{Cache, Entry, MANIFEST, Manifest};
 use super::checkpoint;
 use super::environment;
 use super::error::RunError;
@@ -10,9 +10,9 @@ use super::inputs;
 use super::interrupt::Interrupt;
 use super::progress::Progress;
 use super::provenance::LockFile;
-use super::record::RunDirectory;
+use super::record::{RunDirectory, State};
 use super::schedule::{Schedule, Task};
-use super::stage::{self, Surroundings};
+use super::stage::{self, StageRecord, Surroundings};
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -33,6 +33,10 @@ pub enum Verdict {
     Changed,
     /// Not looked at, and why.
     Skipped,
+    /// It was damaged or gone, and was made again.
+    Repaired,
+    /// It could not be looked at or made again, and why.
+    Failed,
 }
 
 /// How much to do again.
@@ -46,16 +50,35 @@ pub enum Redo {
     All,
 }
 
+/// What to do beside looking.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct How {
+    pub redo: Redo,
+    /// Make again what is damaged or gone.
+    pub repair: bool,
+}
+
+impl From<Redo> for How {
+    fn from(redo: Redo) -> Self {
+        Self {
+            redo,
+            repair: false,
+        }
+    }
+}
+
 /// Stages without a checkpoint that took longer are only done again when all of it is asked for.
 const QUICK_SECONDS: f64 = 60.0;
 
-/// Looks at everything, in the order of the work.
+/// Looks at everything, in the order of the work. What cannot be looked at or made again is a finding like any other; only an
+/// interrupt, or a plan that cannot be read, ends it.
 pub fn verify(
     run: &RunDirectory,
-    redo: Redo,
+    how: impl Into<How>,
     progress: &Progress,
     interrupt: &Interrupt,
 ) -> Result<Vec<Check>, RunError> {
+    let how = how.into();
     let schedule: Schedule = files::read_json(&run.path().join("plan.json"))?;
     let lock: LockFile = files::read_json(&run.path().join("lock.json"))?;
     let cache = Cache::of(run.runs());
@@ -63,26 +86,33 @@ pub fn verify(
     for work in &schedule.works {
         interrupt.check()?;
         let label = work.label(schedule.sweep);
-        let hashed = match cache.look(&work.key) {
-            Entry::Absent => Check::new(&label, Verdict::Skipped, "not made yet, or pruned"),
+        let around = Surroundings {
+            cache: &cache,
+            data: &schedule.data,
+            progress,
+            interrupt,
+            peers: None,
+        };
+        let directory = run.path().join("stages").join(&work.directory);
+        let finished = StageRecord::read(&directory).is_some_and(|r| r.state == State::Done);
+        let mut hashed = match cache.look(&work.key) {
+            Entry::Absent if finished => Check::new(&label, Verdict::Changed, "it is gone"),
+            Entry::Absent => Check::new(&label, Verdict::Skipped, "not made yet"),
             _ => Check::of(
                 &label,
                 cache.rehash(&work.key),
                 "same bytes as when it was made",
             )?,
         };
+        if how.repair && matches!(hashed.verdict, Verdict::Changed | Verdict::Failed) {
+            progress.say(&format!("  repairing: {label}"));
+            hashed = repair(work, hashed, &directory, &around)?;
+        }
         let same = hashed.verdict == Verdict::Same;
         checks.push(hashed);
-        if same && redo != Redo::Nothing {
+        if same && how.redo != Redo::Nothing {
             progress.say(&format!("  again: {label}"));
-            let around = Surroundings {
-                cache: &cache,
-                data: &schedule.data,
-                progress,
-                interrupt,
-                peers: None,
-            };
-            checks.push(again(run, work, &label, redo, &around)?);
+            checks.push(again(run, work, &label, how.redo, &around)?);
         }
     }
     Ok(checks)
@@ -97,14 +127,44 @@ impl Check {
         }
     }
 
-    /// A change is a finding; any other failure is an error of looking.
+    /// A change is a finding, and so is what could not be looked at; an interrupt ends everything.
     fn of(what: &str, result: Result<(), RunError>, same: &str) -> Result<Self, RunError> {
         match result {
             Ok(()) => Ok(Self::new(what, Verdict::Same, same)),
             Err(RunError::Changed { detail, .. }) => Ok(Self::new(what, Verdict::Changed, detail)),
-            Err(error) => Err(error),
+            Err(RunError::Interrupted) => Err(RunError::Interrupted),
+            Err(error) => Ok(Self::new(what, Verdict::Failed, error.to_string())),
         }
     }
+}
+
+/// Makes a damaged artifact again and compares with what its manifest said, where that can still be read.
+fn repair(
+    work: &Task,
+    found: Check,
+    directory: &Path,
+    around: &Surroundings<'_>,
+) -> Result<Check, RunError> {
+    let cache = around.cache;
+    let before: Option<Manifest> = files::read_json(&cache.path(&work.key).join(MANIFEST)).ok();
+    let _lock = cache.lock(&work.key, around.interrupt, |_| {
+        around.progress.say("  waiting for another process");
+    })?;
+    let made = cache
+        .set_aside(&work.key)
+        .and_then(|()| stage::make(work, &found.what, directory, around).map(drop));
+    let why = &found.detail;
+    let (verdict, detail) = match (made, before, cache.look(&work.key)) {
+        (Err(RunError::Interrupted), ..) => return Err(RunError::Interrupted),
+        (Err(error), ..) => (Verdict::Failed, format!("{why}; not made again: {error}")),
+        (Ok(()), Some(before), Entry::Whole(now)) if before.files != now.files => (
+            Verdict::Changed,
+            format!("{why}; made again with other bytes than the first time"),
+        ),
+        (Ok(()), Some(_), _) => (Verdict::Repaired, format!("{why}; made again: same bytes")),
+        (Ok(()), None, _) => (Verdict::Repaired, format!("{why}; made again")),
+    };
+    Ok(Check::new(&found.what, verdict, detail))
 }
 
 fn outside(lock: &LockFile) -> Vec<Check> {
@@ -147,16 +207,21 @@ fn again(
         return Ok(Check::new(&what, Verdict::Skipped, detail));
     }
     let scratch = run.path().join(format!(".verify-{}", environment::pid()));
-    files::remove(&scratch)?;
-    if let Some((step, path)) = &from {
+    let begin = || {
+        files::remove(&scratch)?;
+        let Some((step, path)) = &from else {
+            return Ok(());
+        };
         let name = format!("step-{step:06}");
-        files::copy_tree(path, &scratch.join("checkpoints").join(name))?;
-    }
-    let how = from.map_or_else(
+        files::copy_tree(path, &scratch.join("checkpoints").join(name))
+    };
+    let begun = begin();
+    let how = from.as_ref().map_or_else(
         || "from the beginning: same bytes".to_owned(),
         |(step, _)| format!("from step {step}: same bytes"),
     );
-    let result = stage::redo(work, label, &scratch, around)
+    let result = begun
+        .and_then(|()| stage::redo(work, label, &scratch, around))
         .and_then(|output| compare(work, around.cache, &output));
     files::remove(&scratch)?;
     Check::of(&what, result, &how)

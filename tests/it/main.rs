@@ -5,6 +5,7 @@ mod adt_evaluation;
 mod bad_input;
 mod bad_input_binary;
 mod circles;
+mod damage;
 mod data;
 mod data_shares;
 mod diagnostics;

@@ -249,6 +249,7 @@ fn run_by(
         runs,
         only,
         shard: shard.parse().unwrap(),
+        check: false,
         crew,
         progress: &Progress::silent(),
         interrupt: &Interrupt::default(),

@@ -21,6 +21,7 @@ pub fn run_text(folder: &Path, text: &str) -> Result<Outcome, String> {
         runs: &folder.join("runs"),
         only: None,
         shard: "1/1".parse().unwrap(),
+        check: false,
         crew: WorkerPool::alone(),
         progress: &Progress::silent(),
         interrupt: &Interrupt::default(),
