@@ -7,7 +7,7 @@
 
 use ndarray::{Array, Dimension, Ix1, Ix2, Ix3, Ix4};
 use reviv::evaluation::Outcome;
-use reviv::evaluation::depth::{Space, depth_errors};
+use reviv::evaluation::depth::{Scored, Space, depth_errors};
 use reviv::evaluation::gaze::gaze_errors;
 use reviv::evaluation::joints::{
     HandMode, JointErrors, Valid, joint_errors, pair_of_hands, reconstruction_mm,
@@ -160,7 +160,8 @@ fn compute(metric: &str, npz: &Npz, params: &Value) -> Result<Map<String, Value>
                 Some(other) => return Err(format!("unknown space `{other}`").into()),
             };
             let mask = mask.as_ref().map(|m| m.view());
-            let e = depth_errors(pred.view(), gt.view(), mask, space, params["dmax"].as_f64())?;
+            let range = Scored::between(params["dmin"].as_f64(), params["dmax"].as_f64());
+            let e = depth_errors(pred.view(), gt.view(), mask, space, range)?;
             json!({
                 "abs_rel": e.abs_rel, "delta_1_25": e.delta_1_25, "scale": e.scale, "shift": e.shift,
                 "n_valid": e.n_valid, "degenerate": e.degenerate,

@@ -30,6 +30,7 @@ pub fn write(
     let settings = CompareSettings {
         columns: asked.columns.clone(),
         baseline: asked.baseline.clone(),
+        baselines: asked.baselines.clone(),
         interval: IntervalSettings {
             level: asked.interval.level,
             over: over.collect(),

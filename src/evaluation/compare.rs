@@ -4,12 +4,13 @@ use super::columns::Column;
 use super::published::Published;
 pub use super::row_scores::IntervalSettings;
 use super::row_scores::{AlignedScores, RowScores, add_differences};
+use super::samples;
 use super::scores::{FLOOR, Scores};
-use super::statistics::Over;
+use super::statistics::{Over, least_p, least_p_of_trainings};
 use super::table::{Cell, Row, RowKind, Table};
 use super::verdict;
 use serde::{Deserialize, Serialize};
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 /// One row to be: an arm, a run, another system. Several scores are the same thing under several seeds.
 #[derive(Debug, Clone)]
@@ -26,6 +27,8 @@ pub struct CompareSettings {
     pub columns: Vec<String>,
     /// The entrant that all others are tested against.
     pub baseline: Option<String>,
+    /// Entrants that are tested against another one: of each, the name of the entrant that differs in the one thing it is about.
+    pub baselines: BTreeMap<String, String>,
     pub interval: IntervalSettings,
     /// Show the trivial baselines.
     pub trivial_baselines: bool,
@@ -36,6 +39,7 @@ impl Default for CompareSettings {
         Self {
             columns: Vec::new(),
             baseline: None,
+            baselines: BTreeMap::new(),
             interval: IntervalSettings::default(),
             trivial_baselines: true,
         }
@@ -70,16 +74,7 @@ pub fn compare(
         .find(|e| !e.seeds.is_empty())
         .ok_or(CompareError::Nothing)?;
     let columns = columns(entrants, &settings.columns)?;
-    let baseline =
-        match &settings.baseline {
-            None => None,
-            Some(name) => Some(entrants.iter().position(|e| &e.label == name).ok_or_else(
-                || CompareError::UnknownBaseline {
-                    name: name.clone(),
-                    known: entrants.iter().map(|e| e.label.clone()).collect(),
-                },
-            )?),
-        };
+    let reference = references(entrants, settings)?;
     let common = common_clips(first, entrants)?;
     let sides: Vec<RowScores> = entrants
         .iter()
@@ -102,13 +97,12 @@ pub fn compare(
                 .collect(),
         });
     }
-    if let Some(reference) = baseline {
-        add_differences(&mut rows, &sides, reference, &columns, &settings.interval);
-    }
+    add_differences(&mut rows, &sides, &reference, &columns, &settings.interval);
     if settings.trivial_baselines {
         // They see only the truth, so any entrant's will do; the tokenizer floor is an entrant's own.
         let trivial = first.seeds[0].baselines.iter();
-        for (name, set) in trivial.filter(|(name, _)| *name != FLOOR) {
+        let of_the_truth = |name: &str| name != FLOOR && !name.starts_with(samples::PREFIX);
+        for (name, set) in trivial.filter(|(name, _)| of_the_truth(name)) {
             let side = RowScores {
                 sets: vec![AlignedScores::of(&first.seeds[0], set, &common)],
             };
@@ -124,6 +118,7 @@ pub fn compare(
                 rows.push(row);
             }
         }
+        rows.extend(sampled(entrants, &columns, &common, &settings.interval));
         rows.extend(floors(entrants, &columns, &common, &settings.interval));
     }
     rows.extend(published.map(|p| p.rows(&columns)).unwrap_or_default());
@@ -137,6 +132,61 @@ pub fn compare(
     table.notes.splice(0..0, verdicts);
     table.mark_best();
     Ok(table)
+}
+
+/// The entrant that each entrant is tested against.
+fn references(
+    entrants: &[Method],
+    settings: &CompareSettings,
+) -> Result<Vec<Option<usize>>, CompareError> {
+    let find = |name: &String| {
+        let at = entrants.iter().position(|e| &e.label == name);
+        at.ok_or_else(|| CompareError::UnknownBaseline {
+            name: name.clone(),
+            known: entrants.iter().map(|e| e.label.clone()).collect(),
+        })
+    };
+    for name in settings.baselines.keys() {
+        find(name)?;
+    }
+    let of = |(own, entrant): (usize, &Method)| {
+        let name = settings.baselines.get(&entrant.label);
+        let at = name.or(settings.baseline.as_ref()).map(find).transpose()?;
+        Ok(at.filter(|at| *at != own))
+    };
+    entrants.iter().enumerate().map(of).collect()
+}
+
+/// What entrants that were asked several times give: named after them where there are others.
+fn sampled(
+    entrants: &[Method],
+    columns: &[Column],
+    common: &[String],
+    settings: &IntervalSettings,
+) -> Vec<Row> {
+    let mut rows = Vec::new();
+    for entrant in entrants {
+        for name in [samples::ONE, samples::MEAN, samples::BEST] {
+            let with = (entrant.seeds.iter()).filter(|scores| scores.baselines.contains_key(name));
+            let sets: Vec<AlignedScores> = with
+                .map(|scores| AlignedScores::of(scores, &scores.baselines[name], common))
+                .collect();
+            if sets.is_empty() {
+                continue;
+            }
+            let side = RowScores { sets };
+            let label = match entrants {
+                [_] => name.to_owned(),
+                _ => format!("{name}, {}", entrant.label),
+            };
+            rows.push(Row {
+                label,
+                kind: RowKind::Baseline,
+                cells: columns.iter().map(|c| side.cell(c, settings)).collect(),
+            });
+        }
+    }
+    rows
 }
 
 /// The tokenizer floors: one row for all entrants that share their tokenizers, named after them where not all do.
@@ -249,12 +299,45 @@ fn intervals(settings: &IntervalSettings) -> String {
     let percent = (1e5 * settings.level).round() / 1e3;
     let over = |what| settings.over.contains(&what);
     let how = match (over(Over::Clips), over(Over::Seeds)) {
-        (true, true) => "bootstrap over clips, Student's t over seeds, the wider of the two",
+        (true, true) => {
+            "hierarchical bootstrap, seeds and clips drawn together, or Student's t over seeds where that is wider"
+        }
         (true, false) => "bootstrap over clips",
         (false, true) => "Student's t over seeds",
         (false, false) => return "no intervals".to_owned(),
     };
     format!("[{percent} % interval]: {how}")
+}
+
+/// What the differences are to, how they are tested, and what the tests can say at most.
+fn tests(entrants: &[Method], settings: &CompareSettings) -> Option<String> {
+    let others = settings.baselines.iter();
+    let mut to: Vec<String> = others
+        .map(|(of, to)| format!("of `{of}` to `{to}`"))
+        .collect();
+    to.sort();
+    let to = match (&settings.baseline, to.is_empty()) {
+        (None, true) => return None,
+        (Some(baseline), true) => format!("to `{baseline}`"),
+        (Some(baseline), false) => format!("to `{baseline}`, {}", to.join(", ")),
+        (None, false) => to.join(", "),
+    };
+    let draws = settings.interval.resamples;
+    let least = least_p(draws);
+    let mut text = format!(
+        "differences {to}: bootstrap on common clips, p after Holm over the rows of a column; \
+         no p is smaller than {least:.2e} before Holm ({draws} draws)"
+    );
+    let fewest = entrants.iter().map(|e| e.seeds.len()).min().unwrap_or(0);
+    text += &match (fewest, settings.interval.over.contains(&Over::Seeds)) {
+        (0 | 1, _) => "; with one seed, training again is in no interval and no p".to_owned(),
+        (_, false) => "; seeds are averaged: training again is in no interval and no p".to_owned(),
+        (n, true) => format!(
+            "; seeds are drawn too, and dealing {n} of each arm anew could not give less than {:.2}",
+            least_p_of_trainings(n, n)
+        ),
+    };
+    Some(text)
 }
 
 fn notes(
@@ -268,11 +351,7 @@ fn notes(
         common.len(),
         intervals(&settings.interval)
     )];
-    if let Some(baseline) = &settings.baseline {
-        notes.push(format!(
-            "differences to `{baseline}`: paired bootstrap on common clips, p after Holm over the rows of a column"
-        ));
-    }
+    notes.extend(tests(entrants, settings));
     let mut seen = BTreeSet::new();
     for entrant in entrants {
         for scores in &entrant.seeds {
@@ -357,6 +436,41 @@ mod tests {
     }
 
     #[test]
+    fn an_arm_can_be_tested_against_the_one_it_differs_from_in_one_thing() {
+        let entrant = |label: &str, shift| Method {
+            label: label.into(),
+            seeds: (0..3).map(|seed| scores(seed, 0..60, shift)).collect(),
+        };
+        let entrants = [
+            entrant("full", 0.0),
+            entrant("mixture", 5.0),
+            entrant("uniform", 7.0),
+        ];
+        let settings = CompareSettings {
+            baseline: Some("full".into()),
+            baselines: BTreeMap::from([("uniform".into(), "mixture".into())]),
+            ..CompareSettings::default()
+        };
+        let table = compare("test", &entrants, &settings, None).unwrap();
+        let found = |row: usize| table.rows[row].cells[0].difference.map(|d| d.mean.round());
+        assert_eq!([found(0), found(1), found(2)], [None, Some(5.0), Some(2.0)]);
+        let note = table.notes.join("\n");
+        assert!(
+            note.contains("to `full`, of `uniform` to `mixture`"),
+            "{note}"
+        );
+        assert!(
+            note.contains("no p is smaller than 1.00e-3") && note.contains("less than 0.10"),
+            "{note}"
+        );
+        let unknown = CompareSettings {
+            baselines: BTreeMap::from([("uniform".into(), "nobody".into())]),
+            ..settings
+        };
+        assert!(compare("test", &entrants, &unknown, None).is_err());
+    }
+
+    #[test]
     fn the_note_says_which_intervals_are_printed() {
         let note = |level, over: &[Over]| {
             intervals(&IntervalSettings {
@@ -367,7 +481,7 @@ mod tests {
         };
         assert_eq!(
             note(0.95, &[Over::Seeds, Over::Clips]),
-            "[95 % interval]: bootstrap over clips, Student's t over seeds, the wider of the two"
+            "[95 % interval]: hierarchical bootstrap, seeds and clips drawn together, or Student's t over seeds where that is wider"
         );
         assert_eq!(
             note(0.999, &[Over::Clips]),

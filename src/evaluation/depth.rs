@@ -22,8 +22,38 @@ pub enum Space {
     None,
 }
 
-/// Ground truth at or below this many metres is not scored, and aligned depth is clamped to it.
+/// Ground truth at or below this many metres is not scored where nothing else is said, and aligned depth is clamped to it.
 pub const NEAREST: f64 = 1e-3;
+
+/// Which true depths are scored; aligned depth is clamped to the same range.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Scored {
+    /// `dmin`: true depth at or below it is not scored, metres.
+    pub min: f64,
+    /// `dmax`: true depth at or beyond it is not scored, metres.
+    pub max: f64,
+}
+
+impl Default for Scored {
+    fn default() -> Self {
+        Self::between(None, None)
+    }
+}
+
+impl Scored {
+    /// Between `dmin` (otherwise [`NEAREST`]) and `dmax` (otherwise no limit).
+    #[must_use]
+    pub fn between(min: Option<f64>, max: Option<f64>) -> Self {
+        Self {
+            min: min.unwrap_or(NEAREST).max(NEAREST),
+            max: max.unwrap_or(f64::INFINITY),
+        }
+    }
+
+    fn has(self, depth: f64) -> bool {
+        depth.is_finite() && depth > self.min && depth < self.max
+    }
+}
 /// Farthest aligned depth in disparity space when the data set names no limit.
 const FARTHEST_DISPARITY: f64 = 1000.0;
 
@@ -43,7 +73,7 @@ pub struct DepthErrors {
 }
 
 /// Errors of `pred` against `gt`, both `[T, H, W]`; `gt` in metres. A pixel counts when the mask (if given) says so and the
-/// ground truth is finite, beyond [`NEAREST`] and nearer than `d_max`.
+/// ground truth is finite and in `range`.
 ///
 /// # Errors
 /// When the shapes differ, or a prediction on a scored pixel is not finite.
@@ -52,7 +82,7 @@ pub fn depth_errors<T: Copy + Into<f64>>(
     gt: ArrayView3<T>,
     mask: Option<ArrayView3<bool>>,
     space: Space,
-    d_max: Option<f64>,
+    range: Scored,
 ) -> Result<DepthErrors, MetricError> {
     if pred.dim() != gt.dim() || mask.is_some_and(|m| m.dim() != gt.dim()) {
         return Err(MetricError::Shape {
@@ -61,15 +91,14 @@ pub fn depth_errors<T: Copy + Into<f64>>(
             expected: gt.shape().to_vec(),
         });
     }
-    let pixels = scored_pixels(pred, gt, mask, d_max)?;
+    let pixels = scored_pixels(pred, gt, mask, range)?;
     let Some(fit) = fit(&pixels, space) else {
         return Ok(DepthErrors {
             degenerate: true,
             ..DepthErrors::default()
         });
     };
-    let far = d_max.unwrap_or(f64::INFINITY);
-    let least_disparity = 1.0 / far.min(FARTHEST_DISPARITY);
+    let least_disparity = 1.0 / range.max.min(FARTHEST_DISPARITY);
     let mut inside = 0_usize;
     let mut relative = 0.0;
     for &(p, g) in &pixels {
@@ -78,7 +107,7 @@ pub fn depth_errors<T: Copy + Into<f64>>(
             Space::Disparity => 1.0 / fitted.max(least_disparity),
             _ => fitted,
         };
-        let a = depth.clamp(NEAREST, far);
+        let a = depth.clamp(range.min, range.max);
         relative += (a - g).abs() / g;
         inside += usize::from((a / g).max(g / a) < 1.25);
     }
@@ -97,13 +126,12 @@ fn scored_pixels<T: Copy + Into<f64>>(
     pred: ArrayView3<T>,
     gt: ArrayView3<T>,
     mask: Option<ArrayView3<bool>>,
-    d_max: Option<f64>,
+    range: Scored,
 ) -> Result<Vec<(f64, f64)>, MetricError> {
-    let far = d_max.unwrap_or(f64::INFINITY);
     let mut pixels = Vec::with_capacity(gt.len());
     let mut refused = false;
     let mut push = |p: f64, g: f64| {
-        if g.is_finite() && g > NEAREST && g < far {
+        if range.has(g) {
             refused |= !p.is_finite();
             pixels.push((p, g));
         }
@@ -124,11 +152,7 @@ fn scored_pixels<T: Copy + Into<f64>>(
             .find(|&(i, &p)| {
                 let g: f64 = gt[i].into();
                 let p: f64 = p.into();
-                !p.is_finite()
-                    && mask.is_none_or(|m| m[i])
-                    && g.is_finite()
-                    && g > NEAREST
-                    && g < far
+                !p.is_finite() && mask.is_none_or(|m| m[i]) && range.has(g)
             })
             .map_or(vec![], |((t, y, x), _)| vec![t, y, x]);
         return Err(MetricError::NotFinite {
@@ -202,13 +226,20 @@ mod tests {
         let mut rng = crate::random::stream(0, "depth.test", 0, 0);
         let gt = Array3::from_shape_fn((2, 8, 8), |_| 1.0 + 4.0 * rng.random::<f64>());
         let pred = gt.mapv(|g| g + rng.random::<f64>());
-        let base = depth_errors(pred.view(), gt.view(), None, Space::Depth, None).unwrap();
+        let base = depth_errors(
+            pred.view(),
+            gt.view(),
+            None,
+            Space::Depth,
+            Scored::default(),
+        )
+        .unwrap();
         let other = depth_errors(
             pred.mapv(|p| 50.0 - 7.0 * p).view(),
             gt.view(),
             None,
             Space::Depth,
-            None,
+            Scored::default(),
         )
         .unwrap();
         assert!((base.abs_rel.unwrap() - other.abs_rel.unwrap()).abs() < 1e-12);
@@ -218,9 +249,29 @@ mod tests {
             gt.view(),
             None,
             Space::Disparity,
-            None,
+            Scored::default(),
         )
         .unwrap();
         assert!(disparity.abs_rel.unwrap() < 1e-12 && disparity.delta_1_25 == Some(100.0));
+    }
+
+    #[test]
+    fn only_depth_between_dmin_and_dmax_is_scored() {
+        let gt = Array3::from_shape_fn((1, 1, 5), |(_, _, x)| [0.1, 0.5, 1.0, 2.0, 20.0][x]);
+        let pred = Array3::from_shape_fn((1, 1, 5), |(_, _, x)| [9.0, 0.5, 1.1, 2.0, 1.0][x]);
+        let errors = |min, max| {
+            let range = Scored::between(min, max);
+            depth_errors(pred.view(), gt.view(), None, Space::None, range).unwrap()
+        };
+        let inside = errors(Some(0.2), Some(10.0));
+        assert_eq!(inside.n_valid, 3);
+        assert!((inside.abs_rel.unwrap() - 0.1 / 3.0).abs() < 1e-12);
+        assert_eq!(errors(None, Some(10.0)).n_valid, 4);
+        assert_eq!(errors(Some(0.2), None).n_valid, 4);
+        // A prediction nearer than dmin is taken as dmin.
+        let near = Array3::from_elem((1, 1, 5), 0.01);
+        let range = Scored::between(Some(0.25), Some(0.6));
+        let clamped = depth_errors(near.view(), gt.view(), None, Space::None, range).unwrap();
+        assert!((clamped.abs_rel.unwrap() - 0.5).abs() < 1e-12);
     }
 }

@@ -1,8 +1,10 @@
 //! An evaluation: every clip of a suite, the trivial baselines on the same clips, and what had to be left out.
 
 use super::columns::Column;
+use super::depth;
 use super::metric::{AllClips, Baseline, ClipScore, Mean, MetricSet, OverClips, Pair, set_of};
 use super::outcome::{MetricError, Outcome};
+use super::samples;
 use super::scores::{ColumnScores, FLOOR, FORMAT, ScoreSet, Scores, SetScore};
 use super::suite::{Suite, UnknownMetric};
 use crate::clip::Clip;
@@ -38,6 +40,14 @@ pub trait Pairs: Sync {
     /// When it cannot be computed.
     fn tokenizer_floor(&self, _index: usize) -> Result<Option<Clip>, LoadError> {
         Ok(None)
+    }
+
+    /// Other predictions of the same clip, each from a seed of its own; none where the system was asked once.
+    ///
+    /// # Errors
+    /// When they cannot be read.
+    fn samples(&self, _index: usize) -> Result<Vec<Clip>, LoadError> {
+        Ok(Vec::new())
     }
 }
 
@@ -152,7 +162,7 @@ struct Plan {
     /// By name: those of several modalities that share a name make one prediction.
     baselines: Vec<Box<dyn Baseline>>,
     columns: Vec<Column>,
-    depth_max: Option<f64>,
+    depth: depth::Scored,
 }
 
 /// The columns of one set.
@@ -206,7 +216,7 @@ impl Plan {
             groups,
             baselines,
             columns,
-            depth_max: suite.depth_max,
+            depth: depth::Scored::between(suite.depth_min, suite.depth_max),
         })
     }
 
@@ -269,7 +279,7 @@ impl Plan {
             let pair = Pair {
                 truth: &truth,
                 prediction,
-                depth_max: self.depth_max,
+                depth: self.depth,
             };
             let groups = self.groups.iter();
             let scores = groups.map(|group| group.set.score(&pair, &group.columns));
@@ -308,11 +318,35 @@ impl Plan {
         if let Some(floor) = pairs.tokenizer_floor(index).map_err(load)? {
             baselines.insert(FLOOR, score(&floor)?);
         }
+        let samples = pairs.samples(index).map_err(load)?;
+        let samples: Vec<Scored> = samples.iter().map(score).collect::<Result<_, _>>()?;
+        if let Some(first) = samples.first() {
+            baselines.insert(samples::ONE, first.clone());
+            baselines.insert(samples::MEAN, self.over_samples(&samples, samples::mean_of));
+            baselines.insert(samples::BEST, self.over_samples(&samples, samples::best_of));
+        }
         Ok(Some(Row {
             own,
             baselines,
             missing,
         }))
+    }
+
+    /// What `of` makes of every column of the samples of one clip.
+    fn over_samples(&self, samples: &[Scored], of: fn(&Column, &[Outcome]) -> Outcome) -> Scored {
+        let group = |(position, group): (usize, &Group)| ClipScore {
+            values: group
+                .columns
+                .iter()
+                .enumerate()
+                .map(|(index, column)| {
+                    let all = samples.iter().map(|scored| scored[position].value(index));
+                    of(column, &all.collect::<Vec<_>>())
+                })
+                .collect(),
+            ..ClipScore::default()
+        };
+        self.groups.iter().enumerate().map(group).collect()
     }
 
     /// Turns one method's clips into columns, in the order of the suite; numbers of the whole set stand apart.

@@ -31,6 +31,24 @@ impl Floor {
     }
 }
 
+/// Samples that predictions of a model bring with them.
+#[derive(Debug)]
+struct Samples(Vec<(Predictions, BTreeMap<String, usize>)>);
+
+impl Samples {
+    fn of(predictions: &Predictions) -> Result<Self, PredictionsError> {
+        let samples = predictions.samples()?.into_iter();
+        Ok(Self(samples.map(|s| (s.clone(), s.positions())).collect()))
+    }
+
+    fn clips(&self, id: &str) -> Result<Vec<Clip>, LoadError> {
+        let found = self.0.iter().filter_map(|(s, at)| Some((s, *at.get(id)?)));
+        found
+            .map(|(sample, position)| Ok(sample.load(position)?))
+            .collect()
+    }
+}
+
 /// True and predicted clips in folders, matched by clip id.
 #[derive(Debug)]
 pub struct Folders {
@@ -40,6 +58,7 @@ pub struct Folders {
     /// Position of a clip among the predictions.
     position: BTreeMap<String, usize>,
     floor: Floor,
+    samples: Samples,
 }
 
 impl Folders {
@@ -59,6 +78,7 @@ impl Folders {
             truth,
             position: predictions.positions(),
             floor: Floor::of(&predictions)?,
+            samples: Samples::of(&predictions)?,
             predictions,
         })
     }
@@ -83,6 +103,10 @@ impl Pairs for Folders {
     fn tokenizer_floor(&self, index: usize) -> Result<Option<Clip>, LoadError> {
         self.floor.clip(&self.ids[index])
     }
+
+    fn samples(&self, index: usize) -> Result<Vec<Clip>, LoadError> {
+        self.samples.clips(&self.ids[index])
+    }
 }
 
 /// Why predictions cannot be scored against clips in shards.
@@ -103,6 +127,7 @@ pub struct Stored {
     positions: Vec<(usize, usize)>,
     predictions: Predictions,
     floor: Floor,
+    samples: Samples,
 }
 
 impl Stored {
@@ -131,6 +156,7 @@ impl Stored {
             truth,
             positions,
             floor: Floor::of(&predictions)?,
+            samples: Samples::of(&predictions)?,
             predictions,
         })
     }
@@ -151,5 +177,9 @@ impl Pairs for Stored {
 
     fn tokenizer_floor(&self, index: usize) -> Result<Option<Clip>, LoadError> {
         self.floor.clip(&self.ids[index])
+    }
+
+    fn samples(&self, index: usize) -> Result<Vec<Clip>, LoadError> {
+        self.samples.clips(&self.ids[index])
     }
 }

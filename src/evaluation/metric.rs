@@ -72,8 +72,8 @@ pub trait MetricSet: Sync {
 pub struct Pair<'a> {
     pub truth: &'a Clip,
     pub prediction: &'a Clip,
-    /// True depth at or beyond this many metres is not scored.
-    pub depth_max: Option<f64>,
+    /// Which true depths are scored.
+    pub depth: super::depth::Scored,
 }
 
 impl<'a> Pair<'a> {

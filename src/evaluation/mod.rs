@@ -31,6 +31,7 @@ pub mod render;
 mod row_scores;
 pub mod runtime;
 pub mod sample;
+pub mod samples;
 pub mod scores;
 pub mod sets;
 pub mod statistics;

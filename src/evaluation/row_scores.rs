@@ -4,8 +4,8 @@ use super::columns::Column;
 use super::outcome::{Outcome, mean};
 use super::scores::{ScoreSet, Scores};
 use super::statistics::{
-    Difference, Interval, Over, RESAMPLES, Summary, bootstrap_mean, holm, paired_difference,
-    student_interval, summarise,
+    Difference, Interval, Over, RESAMPLES, Summary, bootstrap_mean, hierarchical_interval, holm,
+    paired_difference, student_interval, summarise,
 };
 use super::table::{Cell, Row};
 use serde::{Deserialize, Serialize};
@@ -18,7 +18,8 @@ pub struct IntervalSettings {
     /// Confidence level.
     #[schemars(range(min = 0.5, max = 0.999))]
     pub level: f64,
-    /// What varies. With both, the wider of the two is printed.
+    /// What varies. With both, seeds and clips are drawn together, and where few seeds make Student's t over them wider, that is
+    /// printed.
     pub over: Vec<Over>,
     /// Bootstrap draws.
     #[schemars(range(min = 100))]
@@ -89,14 +90,24 @@ impl RowScores<'_> {
         let summaries: Vec<Summary> = per_seed.iter().map(|values| summarise(values)).collect();
         let seed_means: Vec<f64> = summaries.iter().filter_map(|s| s.mean).collect();
         let least = summaries.iter().map(|s| s.n).min().unwrap_or(0);
-        let per_clip: Vec<f64> = clip_means(&per_seed).into_iter().flatten().collect();
         let over = |what| settings.over.contains(&what);
         let seeds = over(Over::Seeds)
             .then(|| student_interval(&seed_means, settings.level))
             .flatten();
-        let clips = over(Over::Clips)
-            .then(|| bootstrap_mean(&per_clip, settings.level, settings.resamples, settings.seed))
-            .flatten();
+        let clips = match (over(Over::Clips), over(Over::Seeds)) {
+            (false, _) => None,
+            (true, true) => hierarchical_interval(
+                &numbers(&per_seed),
+                settings.level,
+                settings.resamples,
+                settings.seed,
+            ),
+            (true, false) => {
+                let means = over_seeds(&numbers(&per_seed));
+                let means: Vec<f64> = means.into_iter().flatten().collect();
+                bootstrap_mean(&means, settings.level, settings.resamples, settings.seed)
+            }
+        };
         Cell {
             value: mean(seed_means.iter().copied()),
             interval: wider(seeds, clips),
@@ -141,12 +152,9 @@ impl RowScores<'_> {
     }
 }
 
-/// Every clip's mean over the seeds that have a number; `None` where no seed has one.
-fn clip_means(per_seed: &[Vec<Outcome>]) -> Vec<Option<f64>> {
-    let clips = per_seed.first().map_or(0, Vec::len);
-    (0..clips)
-        .map(|i| mean(per_seed.iter().filter_map(|values| values[i].number())))
-        .collect()
+fn numbers(per_seed: &[Vec<Outcome>]) -> Vec<Vec<Option<f64>>> {
+    let of = |values: &Vec<Outcome>| values.iter().map(|v| v.number()).collect();
+    per_seed.iter().map(of).collect()
 }
 
 fn wider(a: Option<Interval>, b: Option<Interval>) -> Option<Interval> {
@@ -156,11 +164,11 @@ fn wider(a: Option<Interval>, b: Option<Interval>) -> Option<Interval> {
     }
 }
 
-/// Paired differences of every row against row `reference`, Holm-corrected over the rows of each column.
+/// Paired differences of every row against the row that `reference` names for it, Holm-corrected over the rows of each column.
 pub(super) fn add_differences(
     rows: &mut [Row],
     sides: &[RowScores],
-    reference: usize,
+    reference: &[Option<usize>],
     columns: &[Column],
     settings: &IntervalSettings,
 ) {
@@ -168,26 +176,26 @@ pub(super) fn add_differences(
         if column.is_per_set() {
             continue;
         }
-        let means = |side: &RowScores| {
-            let per_seed: Vec<_> = side
-                .sets
-                .iter()
-                .filter_map(|s| s.values(&column.name))
-                .collect();
-            clip_means(&per_seed)
-        };
-        let base = means(&sides[reference]);
+        let trainings: Vec<Vec<Vec<Option<f64>>>> = sides
+            .iter()
+            .map(|side| {
+                let sets = side.sets.iter().filter_map(|s| s.values(&column.name));
+                numbers(&sets.collect::<Vec<_>>())
+            })
+            .collect();
         let mut found: Vec<(usize, Difference)> = Vec::new();
-        for (i, side) in sides.iter().enumerate().filter(|(i, _)| *i != reference) {
-            let pairs: Vec<(f64, f64)> = means(side)
-                .iter()
-                .zip(&base)
-                .filter_map(|(a, b)| Some(((*a)?, (*b)?)))
-                .collect();
-            found.extend(
-                paired_difference(&pairs, settings.level, settings.resamples, settings.seed)
-                    .map(|d| (i, d)),
-            );
+        for (i, side) in trainings.iter().enumerate() {
+            let Some(base) = reference[i].map(|reference| &trainings[reference]) else {
+                continue;
+            };
+            let (level, draws) = (settings.level, settings.resamples);
+            let difference = if settings.over.contains(&Over::Seeds) {
+                paired_difference(side, base, level, draws, settings.seed)
+            } else {
+                let one = |all: &[Vec<Option<f64>>]| [over_seeds(all)];
+                paired_difference(&one(side), &one(base), level, draws, settings.seed)
+            };
+            found.extend(difference.map(|d| (i, d)));
         }
         let p: Vec<f64> = found.iter().filter_map(|(_, d)| d.p).collect();
         let mut corrected = holm(&p).into_iter();
@@ -198,4 +206,12 @@ pub(super) fn add_differences(
             rows[i].cells[position].difference = Some(difference);
         }
     }
+}
+
+/// Every clip's mean over the seeds that have a number; `None` where no seed has one.
+fn over_seeds(trainings: &[Vec<Option<f64>>]) -> Vec<Option<f64>> {
+    let clips = trainings.first().map_or(0, Vec::len);
+    (0..clips)
+        .map(|clip| mean(trainings.iter().filter_map(|values| values[clip])))
+        .collect()
 }

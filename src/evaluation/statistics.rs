@@ -1,4 +1,4 @@
-//! How sure a number is: bootstrap over clips, Student's t over seeds, Holm over arms.
+//! How sure a number is: bootstrap over clips and seeds together, Student's t over seeds, Holm over arms.
 //!
 //! One sample has no interval, and nothing here pretends that it has.
 
@@ -49,7 +49,7 @@ pub struct Interval {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Over {
-    /// Percentile bootstrap over clips: other clips of the same kind.
+    /// Percentile bootstrap over clips: other clips of the same kind; with seeds, both are drawn together.
     Clips,
     /// Student's t over seeds: training again.
     Seeds,
@@ -70,27 +70,71 @@ impl Interval {
 /// Bootstrap draws when nothing else is said.
 pub const RESAMPLES: usize = 2000;
 
+/// One value per clip, once per seed (a training of its own); `None` where a clip has no number. All seeds have the same clips.
+pub type Trainings = [Vec<Option<f64>>];
+
 /// Percentile bootstrap of the mean. `None` below two values: one clip has no spread.
 #[must_use]
 pub fn bootstrap_mean(values: &[f64], level: f64, resamples: usize, seed: u64) -> Option<Interval> {
-    let means = resampled_means(values, resamples, seed)?;
+    let clips = [values.iter().copied().map(Some).collect()];
+    hierarchical_interval(&clips, level, resamples, seed)
+}
+
+/// Percentile bootstrap of the mean in which trainings and clips are drawn together: every draw takes as many seeds and as many clips
+/// as there are, with replacement, the same clips for all seeds. `None` below two clips.
+#[must_use]
+pub fn hierarchical_interval(
+    trainings: &Trainings,
+    level: f64,
+    resamples: usize,
+    seed: u64,
+) -> Option<Interval> {
+    let clips = with_numbers(trainings.first()?.len(), &[trainings]);
+    let means = resampled(clips.len(), resamples, |draw| {
+        let mut rng = crate::random::stream(seed, "evaluation.bootstrap", draw, 0);
+        let chosen = draws(&mut rng, &clips);
+        mean_of_draw(&mut rng, trainings, &chosen)
+    })?;
     Some(percentiles(&means, level))
 }
 
-/// The means of `resamples` draws with replacement, ascending.
-fn resampled_means(values: &[f64], resamples: usize, seed: u64) -> Option<Vec<f64>> {
-    if values.len() < 2 || resamples == 0 {
+/// Positions of the clips for which every side has a number from some seed.
+fn with_numbers(clips: usize, sides: &[&Trainings]) -> Vec<usize> {
+    let has = |side: &Trainings, clip: usize| side.iter().any(|values| values[clip].is_some());
+    (0..clips)
+        .filter(|&clip| sides.iter().all(|side| has(side, clip)))
+        .collect()
+}
+
+/// The finite results of `resamples` draws, ascending.
+fn resampled(clips: usize, resamples: usize, of: impl Fn(u64) -> Option<f64>) -> Option<Vec<f64>> {
+    if clips < 2 || resamples == 0 {
         return None;
     }
-    let n = values.len();
-    let mut means: Vec<f64> = (0..resamples)
-        .map(|draw| {
-            let mut rng = crate::random::stream(seed, "evaluation.bootstrap", draw as u64, 0);
-            (0..n).map(|_| values[rng.random_range(0..n)]).sum::<f64>() / n as f64
-        })
-        .collect();
+    let mut means: Vec<f64> = (0..resamples as u64).filter_map(of).collect();
     means.sort_by(f64::total_cmp);
-    Some(means)
+    (!means.is_empty()).then_some(means)
+}
+
+fn draws(rng: &mut crate::random::StreamRng, from: &[usize]) -> Vec<usize> {
+    (0..from.len())
+        .map(|_| from[rng.random_range(0..from.len())])
+        .collect()
+}
+
+/// The mean over `clips` of as many drawn trainings as there are; a single training is not drawn.
+fn mean_of_draw(
+    rng: &mut crate::random::StreamRng,
+    trainings: &Trainings,
+    clips: &[usize],
+) -> Option<f64> {
+    let all: Vec<usize> = (0..trainings.len()).collect();
+    let chosen = if all.len() > 1 { draws(rng, &all) } else { all };
+    let of = |&training: &usize| {
+        let values = &trainings[training];
+        mean(clips.iter().filter_map(|&clip| values[clip]))
+    };
+    mean(chosen.iter().filter_map(of))
 }
 
 fn percentiles(ascending: &[f64], level: f64) -> Interval {
@@ -123,17 +167,27 @@ pub struct Difference {
     pub p_holm: Option<f64>,
 }
 
-/// The paired bootstrap of `a - b` over pairs `(a, b)` of the same clip. `None` without a pair.
+/// The bootstrap of `a - b`: clips are drawn for both together, since both saw the same; trainings are drawn for each alone, since a
+/// seed has nothing in common between two arms but its number. `None` without a clip that both have.
 #[must_use]
 pub fn paired_difference(
-    pairs: &[(f64, f64)],
+    a: &Trainings,
+    b: &Trainings,
     level: f64,
     resamples: usize,
     seed: u64,
 ) -> Option<Difference> {
-    let differences: Vec<f64> = pairs.iter().map(|(a, b)| a - b).collect();
-    let centre = mean(differences.iter().copied())?;
-    let means = resampled_means(&differences, resamples, seed);
+    let clips = with_numbers(a.first()?.len().min(b.first()?.len()), &[a, b]);
+    let of_all = |side: &Trainings| {
+        let one = |values: &Vec<Option<f64>>| mean(clips.iter().filter_map(|&c| values[c]));
+        mean(side.iter().filter_map(one))
+    };
+    let centre = of_all(a)? - of_all(b)?;
+    let means = resampled(clips.len(), resamples, |draw| {
+        let mut rng = crate::random::stream(seed, "evaluation.bootstrap", draw, 0);
+        let chosen = draws(&mut rng, &clips);
+        Some(mean_of_draw(&mut rng, a, &chosen)? - mean_of_draw(&mut rng, b, &chosen)?)
+    });
     let p = means.as_ref().map(|means| {
         let share = |test: fn(&f64) -> bool| {
             let hits = means.iter().filter(|m| test(m)).count();
@@ -142,12 +196,26 @@ pub fn paired_difference(
         (2.0 * share(|m| *m <= 0.0).min(share(|m| *m >= 0.0))).min(1.0)
     });
     Some(Difference {
-        n: differences.len(),
+        n: clips.len(),
         mean: centre,
         interval: means.map(|means| percentiles(&means, level)),
         p,
         p_holm: None,
     })
+}
+
+/// The smallest p that [`paired_difference`] can give with so many draws.
+#[must_use]
+pub fn least_p(resamples: usize) -> f64 {
+    2.0 / (resamples + 1) as f64
+}
+
+/// The smallest two-sided p that trainings alone can give: the share of the ways to deal the seeds of both arms to two arms that is as
+/// far apart as the one that happened, at best this one and its mirror image.
+#[must_use]
+pub fn least_p_of_trainings(a: usize, b: usize) -> f64 {
+    let ways = (1..=a).fold(1.0, |ways, k| ways * (b + k) as f64 / k as f64);
+    (2.0 / ways).min(1.0)
 }
 
 /// Student's t interval of the mean of `values`, one per seed. `None` below two seeds.
@@ -252,9 +320,9 @@ mod tests {
     fn one_value_has_no_interval() {
         assert_eq!(bootstrap_mean(&[3.0], 0.95, 100, 0), None);
         assert_eq!(student_interval(&[3.0], 0.95), None);
-        let one = paired_difference(&[(3.0, 2.0)], 0.95, 100, 0).unwrap();
+        let one = paired_difference(&[vec![Some(3.0)]], &[vec![Some(2.0)]], 0.95, 100, 0).unwrap();
         assert_eq!((one.n, one.mean, one.interval, one.p), (1, 1.0, None, None));
-        assert_eq!(paired_difference(&[], 0.95, 100, 0), None);
+        assert_eq!(paired_difference(&[], &[], 0.95, 100, 0), None);
     }
 
     #[test]
@@ -274,14 +342,61 @@ mod tests {
     #[test]
     fn a_shift_that_every_clip_shares_is_found_by_pairing() {
         let mut rng = crate::random::stream(1, "statistics.pairs", 0, 0);
-        let pairs: Vec<(f64, f64)> = (0..50)
+        let (a, b) = (0..50)
             .map(|_| {
                 let clip = 100.0 * rng.random::<f64>();
-                (clip + 1.0 + 0.1 * rng.random::<f64>(), clip)
+                (Some(clip + 1.0 + 0.1 * rng.random::<f64>()), Some(clip))
             })
-            .collect();
-        let difference = paired_difference(&pairs, 0.95, 1000, 0).unwrap();
+            .unzip();
+        let difference = paired_difference(&[a], &[b], 0.95, 1000, 0).unwrap();
         assert!(difference.interval.unwrap().low > 1.0 && difference.p.unwrap() < 0.01);
+    }
+
+    /// Two arms of the same method: what differs is the training alone, and hardly from clip to clip. Clips alone find a difference
+    /// in almost every pair of arms; with the trainings drawn too, they do not.
+    #[test]
+    fn a_difference_that_training_again_would_undo_is_not_found() {
+        let trained = |arm: u64, seed: u64| -> Vec<Option<f64>> {
+            let mut rng = crate::random::stream(arm, "statistics.training", seed, 0);
+            let luck = rng.random::<f64>();
+            (0..100)
+                .map(|_| Some(10.0 + luck + 0.1 * rng.random::<f64>()))
+                .collect()
+        };
+        let (mut by_clips, mut by_both) = (0, 0);
+        for trial in 0..40 {
+            let [a, b] = [2 * trial, 2 * trial + 1]
+                .map(|arm| (0..5).map(|seed| trained(arm, seed)).collect::<Vec<_>>());
+            let mean_of = |arm: &[Vec<Option<f64>>]| {
+                vec![
+                    (0..100)
+                        .map(|c| mean(arm.iter().filter_map(|v| v[c])))
+                        .collect::<Vec<_>>(),
+                ]
+            };
+            let p = |a: &Trainings, b: &Trainings| {
+                paired_difference(a, b, 0.95, 400, trial)
+                    .unwrap()
+                    .p
+                    .unwrap()
+            };
+            by_clips += usize::from(p(&mean_of(&a), &mean_of(&b)) < 0.05);
+            by_both += usize::from(p(&a, &b) < 0.05);
+        }
+        assert!(by_clips >= 35, "{by_clips}");
+        // Five trainings a side are few, so that the bootstrap finds somewhat more than one in twenty.
+        assert!(by_both <= 8, "{by_both}");
+    }
+
+    #[test]
+    fn the_smallest_p_is_known_before_anything_is_trained() {
+        assert!((least_p(2000) - 0.001).abs() < 1e-6);
+        assert!((least_p_of_trainings(3, 3) - 0.1).abs() < 1e-12);
+        assert!((least_p_of_trainings(1, 1) - 1.0).abs() < 1e-12);
+        assert!((least_p_of_trainings(5, 5) - 2.0 / 252.0).abs() < 1e-12);
+        let (a, b) = (vec![vec![Some(1.0); 9]], vec![vec![Some(2.0); 9]]);
+        let found = paired_difference(&a, &b, 0.95, 2000, 0).unwrap();
+        assert!((found.p.unwrap() - least_p(2000)).abs() < 1e-12);
     }
 
     #[test]

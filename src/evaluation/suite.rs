@@ -14,7 +14,10 @@ pub struct Suite {
     pub metrics: Vec<String>,
     /// Draw this many clips instead of taking all; anyone with the same clips and seed draws the same.
     pub sample: Option<Sample>,
-    /// Ground-truth depth at or beyond this many metres is not scored.
+    /// Ground-truth depth at or below this many metres is not scored (`dmin`), and predicted depth is clamped to it.
+    #[schemars(range(min = 0.001))]
+    pub depth_min: Option<f64>,
+    /// Ground-truth depth at or beyond this many metres is not scored (`dmax`), and predicted depth is clamped to it.
     #[schemars(range(min = 0.001))]
     pub depth_max: Option<f64>,
 }
@@ -41,6 +44,7 @@ impl Default for Suite {
         Self {
             metrics: metrics.map(str::to_owned).to_vec(),
             sample: None,
+            depth_min: None,
             depth_max: None,
         }
     }

@@ -1,6 +1,7 @@
 //! The one table: typed rows and cells, before anything is printed.
 
 use super::columns::{Better, Column};
+use super::samples::PREFIX;
 use super::statistics::{Difference, Interval};
 use serde::{Deserialize, Serialize};
 
@@ -67,7 +68,7 @@ impl Table {
                 .rows
                 .iter()
                 .enumerate()
-                .filter(|(_, row)| row.kind != RowKind::Published)
+                .filter(|(_, row)| row.kind != RowKind::Published && !row.label.starts_with(PREFIX))
                 .filter_map(|(i, row)| Some((sign * row.cells.get(position)?.value?, i)))
                 .collect();
             ranked.sort_by(|a, b| a.0.total_cmp(&b.0));

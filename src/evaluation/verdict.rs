@@ -1,6 +1,7 @@
 //! Which trivial baselines a system beats, in words: what a reader of a table asks first.
 
 use super::columns::Better;
+use super::samples::PREFIX;
 use super::scores::FLOOR;
 use super::table::{Cell, Row, RowKind, Table};
 
@@ -58,7 +59,8 @@ fn best_trivial(table: &Table, position: usize) -> Option<(&str, &Cell)> {
     table
         .rows
         .iter()
-        .filter(|row| row.kind == RowKind::Baseline && !row.label.starts_with(FLOOR))
+        .filter(|row| row.kind == RowKind::Baseline)
+        .filter(|row| !row.label.starts_with(FLOOR) && !row.label.starts_with(PREFIX))
         .filter_map(|row| {
             let cell = &row.cells[position];
             cell.value.map(|value| (sign * value, row, cell))

@@ -2,6 +2,7 @@
 
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 
 /// How the cells of a sweep become a table: the `compare:` block.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema, Default)]
@@ -9,6 +10,8 @@ use serde::{Deserialize, Serialize};
 pub struct Compare {
     /// The arm that the others are compared with.
     pub baseline: Option<String>,
+    /// Arms that are compared with another arm instead: of each, the name of the arm that differs in the one thing it is about.
+    pub baselines: BTreeMap<String, String>,
     /// Metric columns, in order; all where empty.
     pub columns: Vec<String>,
     /// Confidence intervals.

@@ -232,6 +232,13 @@ impl Op for Evaluate {
             clips.and_then(|clips| clips.contents.get(DEFAULTS)),
             predictions.index.signals.keys(),
         );
+        let mut notes = Vec::new();
+        let samples = predictions.samples().map_err(StageError::other)?.len();
+        if samples > 0 {
+            notes.push(format!(
+                "{samples} samples per clip; `samples: best` is chosen with the truth in hand and is no result of the system"
+            ));
+        }
         let pairs: Box<dyn Pairs> = if let Some(clips) = context.inputs("clips").first() {
             let root = clips.path.join(&settings.split);
             let truth = ClipSet::open(&root).map_err(StageError::other)?;
@@ -243,7 +250,6 @@ impl Op for Evaluate {
             let truth = open(data_root(context, &settings.truth_data)?)?;
             Box::new(Folders::new(truth, predictions).map_err(StageError::other)?)
         };
-        let mut notes = Vec::new();
         if let Some(tmr) = &encoder {
             let chosen = suite.chosen(pairs.ids());
             let made = tmr.embed_pairs(pairs.as_ref(), &chosen, settings.motion_rate);

@@ -16,7 +16,9 @@ use crate::experiment::{
 use crate::masking::PIXELS;
 use crate::mget::MgetSpec;
 use crate::model::{GenerationRequest, Model, ModelError};
-use crate::reconstruction::predictions::{FLOOR, PredictionsWriter, ScaleStatus, SignalNote};
+use crate::reconstruction::predictions::{
+    FLOOR, PredictionsWriter, ScaleStatus, SignalNote, sample_folder,
+};
 use crate::run::environment::Stopwatch;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -48,6 +50,10 @@ pub struct PredictSettings {
     pub reconstruction_bound: bool,
     /// Where the model runs.
     pub device: DeviceChoice,
+    /// How many samples are written beside the predictions, each from a seed of its own; `evaluate` shows one, the mean score and the
+    /// best of them. 1 writes none.
+    #[schemars(range(min = 1, max = 64))]
+    pub samples: usize,
 }
 
 impl Default for PredictSettings {
@@ -63,6 +69,7 @@ impl Default for PredictSettings {
             limit: None,
             reconstruction_bound: true,
             device: DeviceChoice::CPU,
+            samples: 1,
         }
     }
 }
@@ -247,6 +254,14 @@ impl Op for Predict {
         if settings.reconstruction_bound {
             floor = Some(create(&context.output().join(FLOOR), "tokenizer floor")?);
         }
+        let samples = if settings.samples > 1 {
+            settings.samples
+        } else {
+            0
+        };
+        let mut sampled = (0..samples)
+            .map(|n| create(&sample_folder(context.output(), n), "sample"))
+            .collect::<Result<Vec<_>, _>>()?;
         let mut read: Vec<&str> = settings.inputs.iter().map(|name| signal_of(name)).collect();
         if settings.reconstruction_bound {
             read.extend(targets.iter().map(String::as_str));
@@ -273,7 +288,7 @@ impl Op for Predict {
                 .map_err(refused)?;
             let tokens = times
                 .take("generate", count, || {
-                    model.generate(&conditioning, &ids, &request)
+                    model.generate_rounds(&conditioning, &ids, &request, samples)
                 })
                 .map_err(refused)?;
             let made = times
@@ -285,6 +300,16 @@ impl Op for Predict {
                 writer
                     .add(&one.clip, &one.confidence)
                     .map_err(StageError::other)?;
+            }
+            let others = model
+                .decode_samples(&batch, &tokens, &request, samples)
+                .map_err(refused)?;
+            for (writer, made) in sampled.iter_mut().zip(others) {
+                for one in made {
+                    writer
+                        .add(&one.clip, &one.confidence)
+                        .map_err(StageError::other)?;
+                }
             }
             if let Some(floor) = &mut floor {
                 let back = model.round_trip(&batch, &targets).map_err(refused)?;
@@ -298,6 +323,9 @@ impl Op for Predict {
             context.progress(done as u64, total as u64, "clips");
         }
         writer.finish().map_err(StageError::other)?;
+        for writer in sampled {
+            writer.finish().map_err(StageError::other)?;
+        }
         if let Some(floor) = floor {
             floor.finish().map_err(StageError::other)?;
         }
@@ -308,6 +336,7 @@ impl Op for Predict {
             "inputs": settings.inputs,
             "generated": targets,
             "decoding": settings.decoding.name,
+            "samples": settings.samples,
         }))
     }
 }

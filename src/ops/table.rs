@@ -109,6 +109,11 @@ impl Op for TableOp {
         let labels = labels(&settings.labels, &stages, &systems);
         let mut how = settings.compare.clone();
         how.baseline = how.baseline.map(|name| row(name, &labels, &stages));
+        how.baselines = how
+            .baselines
+            .into_iter()
+            .map(|(of, to)| (row(of, &labels, &stages), row(to, &labels, &stages)))
+            .collect();
         let entrants: Vec<Method> = labels
             .into_iter()
             .zip(scores)

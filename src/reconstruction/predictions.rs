@@ -94,6 +94,8 @@ pub struct PredictedClip {
 
 /// The folder beside the index with the truth after a round trip through the model's tokenizers, itself of this form.
 pub const FLOOR: &str = "floor";
+/// The folder beside the index with samples, one folder of this form each: `samples/00`, `samples/01`, ...
+pub const SAMPLES: &str = "samples";
 /// The index's file name.
 pub const INDEX: &str = "predictions.json";
 /// The current [`PredictionsIndex::format`].
@@ -257,6 +259,19 @@ impl Predictions {
             .transpose()
     }
 
+    /// The samples of the same clips, each from a seed of its own; none where only one was asked for.
+    ///
+    /// # Errors
+    /// As [`Predictions::open`].
+    pub fn samples(&self) -> Result<Vec<Self>, PredictionsError> {
+        let folder = |n: usize| sample_folder(&self.directory, n);
+        (0..)
+            .map(folder)
+            .take_while(|folder| folder.join(INDEX).is_file())
+            .map(|folder| Self::open(&folder))
+            .collect()
+    }
+
     /// The position of every clip of the index, by id.
     #[must_use]
     pub fn positions(&self) -> BTreeMap<String, usize> {
@@ -304,6 +319,12 @@ impl Predictions {
             })
             .collect()
     }
+}
+
+/// Where sample `n` of the predictions in `directory` lies.
+#[must_use]
+pub fn sample_folder(directory: &Path, n: usize) -> PathBuf {
+    directory.join(SAMPLES).join(format!("{n:02}"))
 }
 
 /// Every `.npz` below `directory` (two levels of folders at most), in the order of their names.

@@ -197,7 +197,7 @@ mod tests {
             let pair = Pair {
                 truth,
                 prediction,
-                depth_max: None,
+                depth: crate::evaluation::depth::Scored::default(),
             };
             CameraMetrics.score(&pair, &columns)
         };

@@ -203,7 +203,7 @@ mod tests {
             let pair = Pair {
                 truth: &truth,
                 prediction: &prediction,
-                depth_max: None,
+                depth: crate::evaluation::depth::Scored::default(),
             };
             let found = HandsMetrics.score(&pair, &columns).unwrap();
             [found.values[0].number(), found.values[1].number()]

@@ -69,7 +69,7 @@ impl MetricSet for DepthMetrics {
             let space_of = |c: &Column| c.name.split_once('@').is_some_and(|(_, s)| s == name);
             if columns.iter().any(space_of) {
                 let metres = prediction.metres.view();
-                let errors = depth_errors(metres, gt.view(), None, space, pair.depth_max)?;
+                let errors = depth_errors(metres, gt.view(), None, space, pair.depth)?;
                 by_space.push((name, errors));
             }
         }
