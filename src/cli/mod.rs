@@ -10,6 +10,7 @@ mod data;
 mod gc;
 mod import;
 mod list;
+mod machine;
 mod new;
 mod plan;
 mod plan_devices;

@@ -1,5 +1,6 @@
 //! `reviv plan`: the resolved graph, without running it.
 
+use super::machine::{History, Machine};
 use super::plan_devices::Devices;
 use super::request::{Changes, count, open};
 use super::terminal::{Failure, Terminal};
@@ -38,8 +39,15 @@ impl super::Run for Plan {
             prints: Fingerprints::remembered(&cache),
             unread: BTreeMap::new(),
         };
-        let planned =
+        let mut planned =
             plan(&experiment, &cached, &mut |path| outside.hash(path)).map_err(Failure::machine)?;
+        let machine = Machine::here(&cache);
+        let history = History::of(&self.runs, &machine);
+        for stage in &mut planned.stages {
+            let (flop, units) = (stage.plan.flop, stage.plan.work.as_ref().map(|work| work.0));
+            let took = history.seconds(&machine, stage.op, &stage.settings, flop, units);
+            stage.plan.seconds = stage.plan.seconds.or(took);
+        }
         for (path, number) in &outside.unread {
             terminal.note(format_args!(
                 "note: `{}` has {} that were never hashed: `reviv run` does that; what is cached of it is not known here\n",
@@ -136,8 +144,16 @@ fn render(plan: &Planned) -> String {
     if let Some(memory) = plan.memory() {
         totals.push(format!("peak memory {}", bytes(memory)));
     }
-    if let Some(seconds) = plan.seconds().filter(|_| to_do > 0) {
-        totals.push(format!("about {}", duration(seconds)));
+    let (seconds, unknown) = plan.seconds();
+    if to_do > unknown {
+        let of_these = match unknown {
+            0 => String::new(),
+            n => format!(
+                " and what {} take that no run has shown yet",
+                count(n, "stage")
+            ),
+        };
+        totals.push(format!("about {}{of_these}", duration(seconds)));
     }
     if !totals.is_empty() {
         let _ = writeln!(text, "\nto do: {}", totals.join(", "));

@@ -4,6 +4,7 @@ use super::artifact::{ArtifactKind, Description, TokenFacts};
 use super::graph::{ArtifactKey, Experiment, Graph, Stage};
 use super::stage::StagePlan;
 use serde::Serialize;
+use serde_json::Value;
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -45,6 +46,9 @@ pub struct PlannedStage {
     /// The cells that use it, as indices into [`Plan::cells`].
     pub cells: Vec<usize>,
     pub description: Description,
+    /// Resolved.
+    #[serde(skip)]
+    pub settings: Value,
     pub plan: StagePlan,
 }
 
@@ -84,9 +88,11 @@ impl Plan {
         (sum.clips + sum.tokens > 0).then_some(sum)
     }
 
-    /// Seconds of what is to do, where every stage knows its own.
-    pub fn seconds(&self) -> Option<f64> {
-        self.to_do().map(|stage| stage.plan.seconds).sum()
+    /// Seconds of what is to do, as far as they are known, and of how many stages they are not.
+    pub fn seconds(&self) -> (f64, usize) {
+        let known = self.to_do().filter_map(|stage| stage.plan.seconds).sum();
+        let unknown = self.to_do().filter(|stage| stage.plan.seconds.is_none());
+        (known, unknown.count())
     }
 }
 
@@ -127,6 +133,7 @@ pub fn plan(
                 cached: cached(&key),
                 cells: vec![index],
                 description: stage.description.clone(),
+                settings: stage.settings.clone(),
                 plan: answers
                     .entry(question(&cell.graph, stage))
                     .or_insert_with(|| cell.graph.plan(stage))

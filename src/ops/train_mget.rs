@@ -11,9 +11,10 @@ use crate::experiment::{
     Arity, ArtifactKind, Code, Description, Entry, Inputs, Op, OpEntry, Port, Problem,
     StageContext, StageError, StagePlan, TokenFacts, TokenPlan,
 };
+use crate::masking::statistics::ModalityStatistics;
 use crate::masking::{MaskingError, MaskingSettings, PIXELS, simulate};
 use crate::mget::{MgetSpec, ModalitySpec, Positions, Size, SpecError};
-use crate::training::{DatasetSize, TrainingSettings};
+use crate::training::{DatasetSize, TrainingSettings, memory};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
@@ -238,8 +239,11 @@ impl Op for TrainMget {
             .map(|m| m.target.mean as usize)
             .collect();
         let forward = spec.multiply_accumulates(masking.input_tokens as usize, &targets);
-        // Weights, gradients and two moments in f32; activations are small against them at any published size.
-        let state = 4 * 4 * parameters;
+        let mean = |of: fn(&ModalityStatistics) -> f64| -> Vec<f64> {
+            masking.modalities.iter().map(of).collect()
+        };
+        let floats = memory::mget_floats(&spec, &mean(|m| m.input.mean), &mean(|m| m.target.mean));
+        let peak = memory::peak(parameters, floats * training.largest_micro_batch() as f64);
         StagePlan {
             shapes: vec![
                 (
@@ -269,7 +273,7 @@ impl Op for TrainMget {
                 })
                 .collect(),
             work: Some((steps, "steps".into())),
-            memory: Some(state),
+            memory: Some(peak),
             disk: Some(4 * parameters),
             // Backward costs twice the forward; a multiply-accumulate is two operations.
             flop: Some(6.0 * forward * samples as f64),

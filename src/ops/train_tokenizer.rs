@@ -23,7 +23,7 @@ use crate::tokenizer::video::Network;
 use crate::tokenizer::video::padding::Padding;
 use crate::tokenizer::vq::VqVae;
 use crate::training::tokenizer::TokenizerTraining;
-use crate::training::{AdamWSettings, Duration, Keep};
+use crate::training::{AdamWSettings, Duration, Keep, memory};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
@@ -329,8 +329,15 @@ impl Op for TrainTokenizer {
                 mean_target: None,
             }],
             work: Some((settings.steps, "steps".to_owned())),
-            // Weights, gradients and two moments in f32.
-            memory: parameters.map(|count| 16 * count),
+            memory: parameters
+                .zip(floats(entry, &shape))
+                .map(|(count, floats)| {
+                    let at_once = match settings.micro_batch {
+                        0 => settings.batch,
+                        size => size.min(settings.batch),
+                    };
+                    memory::peak(count, floats * at_once as f64)
+                }),
             disk: parameters.map(|count| 4 * count),
             flop,
             ..StagePlan::default()
@@ -450,6 +457,29 @@ fn encode_seconds(entry: &TokenizerEntry, shape: &Shape, tokens: &TokenFacts) ->
             Some(4.3 * pixels * (settings.channels as f64 / 128.0).powi(2))
         }
         _ => None,
+    }
+}
+
+/// Numbers that a forward pass leaves per signal.
+fn floats(entry: &TokenizerEntry, shape: &Shape) -> Option<f64> {
+    match (entry, shape) {
+        (TokenizerEntry::Vq(settings), _) => {
+            let patches = settings.patches(shape).ok()?;
+            Some(memory::vq_floats(
+                settings,
+                patches.tokens(),
+                patches.width(),
+            ))
+        }
+        (
+            TokenizerEntry::Video(settings),
+            Shape::Video {
+                frames,
+                height,
+                width,
+            },
+        ) => Some(memory::video_floats(settings, [*frames, *height, *width])),
+        (TokenizerEntry::Video(_), _) => None,
     }
 }
 

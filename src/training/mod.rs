@@ -12,6 +12,7 @@
 pub mod fit;
 pub mod kmeans;
 pub mod loader;
+pub mod memory;
 pub mod mget;
 pub mod mget_fit;
 pub mod mixture;

@@ -203,6 +203,12 @@ impl TrainingSettings {
         )?)
     }
 
+    /// Samples that pass through the model at once.
+    #[must_use]
+    pub fn largest_micro_batch(&self) -> usize {
+        self.micro_batches().into_iter().max().unwrap_or(self.batch)
+    }
+
     /// Samples of each micro-batch of a step.
     #[must_use]
     pub fn micro_batches(&self) -> Vec<usize> {

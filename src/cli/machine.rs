@@ -1,0 +1,189 @@
+//! How long work takes here: what this machine multiplies and moves per second, measured once and kept beside the cache, and how long
+//! earlier runs took for what they had planned.
+
+use crate::engine::ops::gemm::{Matrix, Threads, product};
+use crate::run::environment::{self, Stopwatch};
+use crate::run::schedule::Schedule;
+use crate::run::stage::StageRecord;
+use crate::run::{Cache, RunDirectory, State, files};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::path::Path;
+
+/// What a machine does per second, with all its threads.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Machine {
+    pub host: String,
+    pub threads: usize,
+    /// Floating point operations in products of matrices.
+    pub products: f64,
+    /// Bytes copied.
+    pub memory: f64,
+}
+
+const FILE: &str = "machine.json";
+/// Side of the matrices that are multiplied: small enough for a cache, as those of a training step are.
+const SIDE: usize = 256;
+/// Seconds that each measurement takes.
+const LONG: f64 = 0.1;
+/// Of the products per second, what a training step reaches where no run has shown it.
+const USUAL: f64 = 3.0;
+
+impl Machine {
+    /// What was measured here before, or what is measured now.
+    #[must_use]
+    pub fn here(cache: &Cache) -> Self {
+        let path = cache.root().join(FILE);
+        let (host, threads) = (environment::host(), rayon::current_num_threads());
+        if let Ok(known) = files::read_json::<Self>(&path)
+            && known.host == host
+            && known.threads == threads
+        {
+            return known;
+        }
+        let measured = Self {
+            host,
+            threads,
+            products: rate(|| {
+                let values = vec![0.5_f32; SIDE * SIDE];
+                let of = || Matrix::rows(&values, SIDE, SIDE);
+                std::hint::black_box(product(of(), of(), None, Threads::All));
+                2.0 * (SIDE * SIDE * SIDE) as f64
+            }),
+            memory: rate(|| {
+                let from = vec![1_u8; 1 << 22];
+                std::hint::black_box(from.clone());
+                2.0 * from.len() as f64
+            }),
+        };
+        // Where nothing can be written, it is measured again.
+        let _ = files::create_directory(cache.root())
+            .and_then(|()| files::write_json(&path, &measured));
+        measured
+    }
+}
+
+/// How much of something `work` does per second.
+fn rate(work: impl Fn() -> f64) -> f64 {
+    work();
+    let watch = Stopwatch::start();
+    let mut done = 0.0;
+    while watch.seconds() < LONG {
+        done += work();
+    }
+    done / watch.seconds()
+}
+
+/// What earlier runs took, by kind of work.
+#[derive(Debug, Clone, Default)]
+pub struct History {
+    /// Seconds per second that the products alone would take, by op.
+    by_products: BTreeMap<String, Vec<f64>>,
+    /// Seconds per unit of work, by op and what it works on.
+    by_work: BTreeMap<String, Vec<f64>>,
+}
+
+impl History {
+    /// Of all finished stages of the runs in a folder.
+    #[must_use]
+    pub fn of(runs: &Path, machine: &Machine) -> Self {
+        let mut history = Self::default();
+        for run in RunDirectory::all(runs).unwrap_or_default() {
+            let Ok(schedule) = files::read_json::<Schedule>(&run.path().join("plan.json")) else {
+                continue;
+            };
+            for work in &schedule.works {
+                let directory = run.path().join("stages").join(&work.directory);
+                let record = StageRecord::read(&directory);
+                let own = |r: &StageRecord| r.state == State::Done && r.found.is_none();
+                let Some(record) = record.filter(own).filter(|r| r.seconds > 0.0) else {
+                    continue;
+                };
+                if let Some(flop) = work.plan["flop"].as_f64().filter(|flop| *flop > 0.0) {
+                    let ideal = flop / machine.products;
+                    let of_op = history.by_products.entry(work.op.clone()).or_default();
+                    of_op.push(record.seconds / ideal);
+                }
+                if let Some(units) = work.plan["work"][0].as_f64().filter(|n| *n > 0.0) {
+                    let key = kind(&work.op, &work.settings);
+                    let of_kind = history.by_work.entry(key).or_default();
+                    of_kind.push(record.seconds / units);
+                }
+            }
+        }
+        history
+    }
+
+    /// Seconds that a stage will take; `None` where nothing is known of its kind.
+    #[must_use]
+    pub fn seconds(
+        &self,
+        machine: &Machine,
+        op: &str,
+        settings: &serde_json::Value,
+        flop: Option<f64>,
+        units: Option<u64>,
+    ) -> Option<f64> {
+        if let Some(flop) = flop {
+            let factor = self.by_products.get(op).and_then(|seen| median(seen));
+            return Some(flop / machine.products * factor.unwrap_or(USUAL));
+        }
+        let each = median(self.by_work.get(&kind(op, settings))?)?;
+        Some(each * units? as f64)
+    }
+}
+
+/// Work of one op on one modality with one batch has one price per unit.
+fn kind(op: &str, settings: &serde_json::Value) -> String {
+    let part = |key: &str| settings.get(key).map(ToString::to_string);
+    let parts = ["modality", "batch", "decoding"].map(part);
+    format!("{op} {parts:?}")
+}
+
+fn median(values: &[f64]) -> Option<f64> {
+    let mut sorted = values.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    sorted.get(sorted.len() / 2).copied()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    #[test]
+    fn earlier_runs_refine_what_the_machine_alone_would_say() {
+        let machine = Machine {
+            host: "here".into(),
+            threads: 2,
+            products: 1e9,
+            memory: 1e9,
+        };
+        let mut history = History::default();
+        let of = |history: &History, flop, units| {
+            let settings = json!({"modality": "body", "batch": 8});
+            history.seconds(&machine, "train_mget", &settings, flop, units)
+        };
+        assert_eq!(of(&history, Some(1e9), None), Some(USUAL));
+        assert_eq!(of(&history, None, Some(10)), None);
+        history
+            .by_products
+            .insert("train_mget".into(), vec![9.0, 5.0, 4.0]);
+        assert_eq!(of(&history, Some(2e9), None), Some(10.0));
+        let key = kind("train_mget", &json!({"modality": "body", "batch": 8}));
+        history.by_work.insert(key, vec![0.5]);
+        assert_eq!(of(&history, None, Some(10)), Some(5.0));
+    }
+
+    #[test]
+    fn a_machine_is_measured_once() {
+        let folder = tempfile::tempdir().unwrap();
+        let cache = Cache::new(folder.path());
+        let measured = Machine::here(&cache);
+        assert!(
+            measured.products > 1e6 && measured.memory > 1e6,
+            "{measured:?}"
+        );
+        assert_eq!(Machine::here(&cache), measured);
+    }
+}

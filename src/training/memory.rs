@@ -1,0 +1,111 @@
+//! How much memory a training needs, before anything is allocated: what the optimizer holds, and what a forward pass leaves for the
+//! backward pass, counted from the layers. `cargo bench --bench plan` compares with what trainings were seen to take.
+
+use crate::mget::MgetSpec;
+use crate::tokenizer::video::VideoSettings;
+use crate::tokenizer::vq::VqSettings;
+
+/// Bytes of a number.
+const F32: f64 = 4.0;
+/// Copies of every parameter: the value, its gradient and two moments.
+const COPIES: f64 = 4.0;
+/// Gradients of activations that live at once, blocks of the allocator that are larger than what was asked for, and what it keeps
+/// for the next step, as a share of what the forward pass leaves: measured by `cargo bench --bench plan`.
+const BACKWARD: f64 = 1.25;
+/// The program, its threads and its buffers: measured by the same bench.
+const PROGRAM: f64 = 48e6;
+
+/// Peak bytes of a training with so many parameters, whose forward pass leaves `floats` numbers per step.
+#[must_use]
+pub fn peak(parameters: u64, floats: f64) -> u64 {
+    (PROGRAM + F32 * (COPIES * parameters as f64 + BACKWARD * floats)) as u64
+}
+
+/// Numbers that a forward pass of MGET leaves per sample, of which `visible` tokens of every modality are seen and `targets` asked for.
+#[must_use]
+pub fn mget_floats(spec: &MgetSpec, visible: &[f64], targets: &[f64]) -> f64 {
+    let (d, h) = (spec.size.width as f64, spec.size.hidden() as f64);
+    let (n, m): (f64, f64) = (visible.iter().sum(), targets.iter().sum());
+    // Input and output of the norm, queries, keys, values, what attention gives, the sum, the second norm; two hidden states and
+    // their product.
+    let encoder = n * (8.0 * d + 3.0 * h);
+    // The same for the targets, with queries of their own and what they get from the context; keys and values of the context.
+    let decoder = m * (12.0 * d + 3.0 * h) + n * 3.0 * d;
+    let tables: f64 = spec
+        .modalities
+        .iter()
+        .zip(targets)
+        .map(|(modality, count)| {
+            // Logits and their gradient.
+            2.0 * count * modality.vocabulary().unwrap_or(0) as f64
+        })
+        .sum();
+    let pixels: f64 = spec
+        .modalities
+        .iter()
+        .zip(visible)
+        .map(|(modality, count)| count * modality.tubelet_values().unwrap_or(0) as f64)
+        .sum();
+    let ends = 4.0 * d * (n + m);
+    spec.size.encoder_depth as f64 * encoder
+        + spec.size.decoder_depth as f64 * decoder
+        + tables
+        + pixels
+        + ends
+}
+
+/// Numbers that a forward pass of a VQ-VAE leaves per signal of `tokens` tokens that are patches of `patch` numbers.
+#[must_use]
+pub fn vq_floats(settings: &VqSettings, tokens: usize, patch: usize) -> f64 {
+    let (w, n) = (settings.width as f64, tokens as f64);
+    let block = n * w * (8.0 + 2.0 * settings.mlp_ratio as f64);
+    let ends = n * (6.0 * patch as f64 + 6.0 * w + 4.0 * settings.code_width as f64);
+    // Distances to all codes.
+    let codes = 2.0 * n * settings.codebook as f64;
+    2.0 * settings.depth as f64 * block + ends + codes
+}
+
+/// Numbers that a forward pass of a video tokenizer leaves per video of `[frames, height, width]`.
+#[must_use]
+pub fn video_floats(settings: &VideoSettings, [frames, height, width]: [usize; 3]) -> f64 {
+    let patch = settings.patch;
+    // The first frame stands for a whole block.
+    let mut extent = [frames.div_ceil(patch) + 1, height / patch, width / patch];
+    if patch == 1 {
+        extent[0] = frames;
+    }
+    let residual = |inputs: f64, outputs: f64| 2.0 * inputs + 7.0 * outputs;
+    let cells = |e: [usize; 3]| e.iter().product::<usize>() as f64;
+    let halved = |e: [usize; 3], space: bool, time: bool| {
+        let side = |n: usize| if space { n.div_ceil(2) } else { n };
+        let first = if time { e[0].div_ceil(2) } else { e[0] };
+        [first, side(e[1]), side(e[2])]
+    };
+    let levels = settings.multipliers.len();
+    let mut floats = 2.0 * cells(extent) * (2 * settings.coefficients() + settings.channels) as f64;
+    let mut channels = settings.channels as f64;
+    let mut extents = Vec::new();
+    for level in 0..levels {
+        let own = settings.width(level) as f64;
+        extents.push(extent);
+        for _ in 0..settings.blocks {
+            floats += cells(extent) * residual(channels, own);
+            channels = own;
+        }
+        let way = settings.down(level);
+        extent = halved(extent, way.space, way.time);
+        floats += cells(extent) * 3.0 * own;
+    }
+    // Two residual blocks and two attentions, in the encoder and in the decoder.
+    floats += 2.0 * cells(extent) * channels * (2.0 * 9.0 + 2.0 * 8.0);
+    for level in (0..levels).rev() {
+        let own = settings.width(level) as f64;
+        let here = extents.get(level + 1).copied().unwrap_or(extent);
+        for _ in 0..=settings.blocks {
+            floats += cells(here) * residual(channels, own);
+            channels = own;
+        }
+        floats += cells(extents[level]) * 3.0 * own;
+    }
+    floats
+}
