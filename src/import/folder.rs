@@ -13,6 +13,7 @@ use super::ImportError;
 use super::part::{Part, Tensor, Values};
 use super::statistics::Statistics;
 use crate::clip::clock;
+use crate::clip::depth_video::DepthCoding;
 use crate::engine::{Compute, Initialise, Parameters};
 use crate::evaluation::tmr::features::FEATURES;
 use crate::evaluation::tmr::{MotionEncoder, MotionEncoderSettings, stored as tmr};
@@ -61,12 +62,22 @@ impl Model {
     }
 }
 
-/// The clips of a set: of the size that its tokenizer of RGB takes, else that of its raw video, else the paper's.
-pub(super) fn clips<'a>(
-    spec: &MgetSpec,
-    mut models: impl Iterator<Item = &'a Model>,
-) -> ClipFormat {
-    let rgb = models.find(|model| model.name == "rgb");
+/// The clips of a set: of the size that its tokenizer of RGB takes, else that of its raw video, else the paper's. With the video
+/// tokenizer of the 512 pathway they are that pathway's, whose depth is in metres.
+pub(super) fn clips<'a>(spec: &MgetSpec, models: impl Iterator<Item = &'a Model>) -> ClipFormat {
+    let mut rgb = None;
+    for model in models {
+        match model.name.as_str() {
+            "rgb_512" if model.clip.is_some() => {
+                return ClipFormat {
+                    depth: DepthCoding::metric(),
+                    ..sized(model.clip, ClipFormat::default())
+                };
+            }
+            "rgb" => rgb = Some(model),
+            _ => {}
+        }
+    }
     let pixels = spec
         .modalities
         .iter()
@@ -76,8 +87,13 @@ pub(super) fn clips<'a>(
             }
             _ => None,
         });
-    let format = ClipFormat::default();
-    match rgb.and_then(|model| model.clip).or(pixels) {
+    let clip = rgb.and_then(|model| model.clip).or(pixels);
+    sized(clip, ClipFormat::default())
+}
+
+/// Clips of two seconds with video of `clip` frames, height and width.
+fn sized(clip: Option<[usize; 3]>, format: ClipFormat) -> ClipFormat {
+    match clip {
         Some([frames, size, _]) => ClipFormat {
             frames,
             size,

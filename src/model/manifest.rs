@@ -19,6 +19,9 @@ pub struct ModelManifest {
     pub clips: ClipFormat,
     /// blake3 of the files of every tokenizer, by modality.
     pub tokenizers: BTreeMap<String, String>,
+    /// The data sets it was trained on, `world` for the synthetic one; empty where nobody said.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub trained_on: Vec<String>,
 }
 
 impl ModelManifest {
@@ -28,7 +31,20 @@ impl ModelManifest {
     /// When a file cannot be read.
     pub fn of(folder: &Path, clips: ClipFormat) -> Result<Self, ModelError> {
         let tokenizers = Self::digests(folder)?;
-        Ok(Self { clips, tokenizers })
+        Ok(Self {
+            clips,
+            tokenizers,
+            trained_on: Vec::new(),
+        })
+    }
+
+    /// With what the model was trained on.
+    #[must_use]
+    pub fn trained_on(mut self, mut sources: Vec<String>) -> Self {
+        sources.sort();
+        sources.dedup();
+        self.trained_on = sources;
+        self
     }
 
     /// What [`ModelManifest::tokenizers`] says of the tokenizers that lie in `folder`; nothing where there are none.

@@ -8,6 +8,8 @@
 mod error;
 mod evaluate;
 mod manifest;
+mod mean;
+mod pathway;
 mod tokenizers;
 
 pub use error::ModelError;
@@ -17,7 +19,9 @@ pub use tokenizers::Tokenizers;
 
 use self::error::{not_a_model, wrong_clip};
 use self::manifest::digest;
-use crate::clip::{Clip, Signal};
+use self::mean::{Mean, per_sample, seed_of_round};
+use self::pathway::Pathway;
+use crate::clip::{Clip, DEPTH, RGB, Signal};
 use crate::decoding::{
     DecodingSettings, Generated, GeneratedTokens, MgetTokens, Sample, Slot, generate_samples,
 };
@@ -26,7 +30,6 @@ use crate::masking::PIXELS;
 use crate::mget::{Content, Mget, ModalitySpec};
 use crate::modality::{ClipFormat, Modality};
 use crate::tokenizer::{self, TokenGrid, Tokenizer};
-use rand::RngExt;
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -35,6 +38,8 @@ use std::path::Path;
 pub struct Model {
     mget: Mget,
     tokenizers: Tokenizers,
+    trained_on: Vec<String>,
+    pathway: Pathway,
 }
 
 impl std::fmt::Debug for Model {
@@ -85,15 +90,18 @@ impl Model {
         let folder = folder.as_ref();
         let manifest = ModelManifest::read(folder)?;
         let mget = Mget::open(folder, compute).map_err(|error| not_a_model(folder, error))?;
+        let pathway = Pathway::of(mget.spec(), &manifest.clips);
         let mut tokenizers = Tokenizers::new(manifest.clips);
         for slot in &mget.spec().modalities {
-            let name = &slot.name;
+            let Some(name) = pathway.modality(&slot.name) else {
+                continue;
+            };
             // Raw video has no tokens; video of the release's other size is none of these clips'.
             if slot.vocabulary().is_none() || !tokenizers.knows(name) {
                 continue;
             }
-            let path = folder.join(TOKENIZERS).join(name);
-            let expected = manifest.tokenizers.get(name).ok_or_else(|| {
+            let path = folder.join(TOKENIZERS).join(&slot.name);
+            let expected = manifest.tokenizers.get(&slot.name).ok_or_else(|| {
                 not_a_model(
                     folder,
                     format_args!("`{FILE}` names no tokenizer of `{name}`"),
@@ -109,14 +117,14 @@ impl Model {
             if *expected != found {
                 return Err(ModelError::OtherTokenizer {
                     path,
-                    modality: name.clone(),
+                    modality: name.to_owned(),
                     expected: expected.clone(),
                     found,
                 });
             }
             tokenizers.insert_as(name, tokenizer::open(&path, compute)?.into());
         }
-        Self::new(mget, tokenizers)
+        Ok(Self::new(mget, tokenizers)?.with_trained_on(manifest.trained_on))
     }
 
     /// A transformer and the tokenizers it was trained on.
@@ -124,8 +132,10 @@ impl Model {
     /// # Errors
     /// When a tokenizer has other tokens than the transformer predicts.
     pub fn new(mget: Mget, tokenizers: Tokenizers) -> Result<Self, ModelError> {
+        let pathway = Pathway::of(mget.spec(), tokenizers.format());
         for slot in &mget.spec().modalities {
-            let Some(tokenizer) = tokenizers.get(&slot.name) else {
+            let own = pathway.modality(&slot.name);
+            let Some(tokenizer) = own.and_then(|name| tokenizers.get(name)) else {
                 continue;
             };
             let count: usize = tokenizer.grid().iter().product();
@@ -141,6 +151,8 @@ impl Model {
         Ok(Self {
             mget: mget.frozen(),
             tokenizers,
+            trained_on: Vec::new(),
+            pathway,
         })
     }
 
@@ -156,8 +168,22 @@ impl Model {
         };
         std::fs::create_dir_all(folder).map_err(io)?;
         self.mget.save(folder)?;
-        self.tokenizers.write(&folder.join(TOKENIZERS))?;
-        ModelManifest::of(folder, self.format().clone())?.write(folder)
+        let place = |name: &str| folder.join(TOKENIZERS).join(&*self.pathway.slot(name));
+        self.tokenizers.write_each(place)?;
+        let manifest = ModelManifest::of(folder, self.format().clone())?;
+        manifest.trained_on(self.trained_on.clone()).write(folder)
+    }
+
+    /// The same model, which says what it was trained on.
+    #[must_use]
+    pub fn with_trained_on(self, trained_on: Vec<String>) -> Self {
+        Self { trained_on, ..self }
+    }
+
+    /// The data sets it was trained on, `world` for the synthetic one; empty where nobody said.
+    #[must_use]
+    pub fn trained_on(&self) -> &[String] {
+        &self.trained_on
     }
 
     /// The sizes of the clips the model takes.
@@ -181,7 +207,7 @@ impl Model {
     /// Whether raw video is an input beside the tokens.
     #[must_use]
     pub fn takes_pixels(&self) -> bool {
-        self.mget.spec().index(PIXELS).is_some()
+        self.mget.spec().index(&self.pathway.slot(PIXELS)).is_some()
     }
 
     /// The modalities it knows, raw video aside.
@@ -226,6 +252,52 @@ impl Model {
         self.decode(clips, &generated, request)
     }
 
+    /// As [`Model::predict`], and beside it `count` samples of every clip, each from a seed of its own. What is given is encoded once,
+    /// and passes the encoder once where the decoding takes a single step. Samples have no video and no depth.
+    ///
+    /// # Errors
+    /// As [`Model::predict`].
+    pub fn predict_samples(
+        &self,
+        clips: &[Clip],
+        ids: &[u64],
+        request: &GenerationRequest<'_>,
+        count: usize,
+    ) -> Result<(Vec<Reconstructed>, Vec<Vec<Reconstructed>>), ModelError> {
+        let conditioning = self.encode_inputs(clips, request.inputs)?;
+        let rounds = self.generate_rounds(&conditioning, ids, request, count)?;
+        let made = self.decode(clips, &rounds, request)?;
+        Ok((made, self.decode_samples(clips, &rounds, request, count)?))
+    }
+
+    /// Every one of the first `count` rounds by itself, without video and depth, whose decoding takes longest.
+    ///
+    /// # Errors
+    /// As [`Model::decode`].
+    pub fn decode_samples(
+        &self,
+        clips: &[Clip],
+        rounds: &[Vec<Generated>],
+        request: &GenerationRequest<'_>,
+        count: usize,
+    ) -> Result<Vec<Vec<Reconstructed>>, ModelError> {
+        let pictures = [RGB.name(), DEPTH.name()];
+        let targets: Vec<String> = request
+            .targets
+            .iter()
+            .filter(|target| !pictures.contains(&target.as_str()))
+            .cloned()
+            .collect();
+        let request = GenerationRequest {
+            targets: &targets,
+            ..request.clone()
+        };
+        let rounds = rounds.iter().take(count);
+        rounds
+            .map(|round| self.decode(clips, std::slice::from_ref(round), &request))
+            .collect()
+    }
+
     /// Generates the tokens of the targets, once per sample that is averaged; the middle of [`Model::predict`].
     ///
     /// # Errors
@@ -236,6 +308,20 @@ impl Model {
         ids: &[u64],
         request: &GenerationRequest<'_>,
     ) -> Result<Vec<Vec<Generated>>, ModelError> {
+        self.generate_rounds(conditioning, ids, request, 1)
+    }
+
+    /// As [`Model::generate`], at least `least` times; every time has a seed of its own.
+    ///
+    /// # Errors
+    /// When a modality is unknown.
+    pub fn generate_rounds(
+        &self,
+        conditioning: &Conditioning<'_>,
+        ids: &[u64],
+        request: &GenerationRequest<'_>,
+        least: usize,
+    ) -> Result<Vec<Vec<Generated>>, ModelError> {
         let samples: Vec<Sample<'_>> = ids
             .iter()
             .enumerate()
@@ -244,14 +330,17 @@ impl Model {
                 slots: self.slots(conditioning, clip),
             })
             .collect();
-        let targets: Vec<&str> = request.targets.iter().map(String::as_str).collect();
+        let slots: Vec<_> = (request.targets.iter())
+            .map(|name| self.pathway.slot(name))
+            .collect();
+        let targets: Vec<&str> = slots.iter().map(AsRef::as_ref).collect();
         let model = MgetTokens::new(&self.mget);
-        let seeds: Vec<u64> = (0..request.decoding.samples.max(1))
+        let seeds: Vec<u64> = (0..request.decoding.samples.max(least).max(1))
             .map(|round| seed_of_round(request.seed, round))
             .collect();
         Ok(generate_samples(
             &model,
-            request.decoding,
+            &self.pathway.decoding(request.decoding),
             &samples,
             &targets,
             &seeds,
@@ -282,7 +371,7 @@ impl Model {
             for generated in rounds.iter().take(request.decoding.samples_of(name)) {
                 let own: Vec<&GeneratedTokens> = generated
                     .iter()
-                    .filter_map(|g| g.targets.get(name))
+                    .filter_map(|g| g.targets.get(&*self.pathway.slot(name)))
                     .collect();
                 let grids: Vec<TokenGrid> = own
                     .iter()
@@ -366,15 +455,18 @@ impl Model {
 
     /// One slot per modality of the model, for one clip.
     fn slots<'a>(&self, conditioning: &'a Conditioning<'_>, clip: usize) -> Vec<Slot<'a>> {
-        let of = |slot: &ModalitySpec| match conditioning.tokens.get(slot.name.as_str()) {
-            Some(grids) => Slot::input(grids[clip].ids.clone()),
-            None if slot.vocabulary().is_none() => {
-                Slot::Pixels(match conditioning.pixels.get(clip) {
-                    Some(values) if slot.name == PIXELS => Content::Floats(values),
-                    _ => Content::Absent,
-                })
+        let of = |slot: &ModalitySpec| {
+            let name = self.pathway.modality(&slot.name);
+            match name.and_then(|name| conditioning.tokens.get(name)) {
+                Some(grids) => Slot::input(grids[clip].ids.clone()),
+                None if slot.vocabulary().is_none() => {
+                    Slot::Pixels(match conditioning.pixels.get(clip) {
+                        Some(values) if name == Some(PIXELS) => Content::Floats(values),
+                        _ => Content::Absent,
+                    })
+                }
+                None => Slot::masked(slot.count()),
             }
-            None => Slot::masked(slot.count()),
         };
         self.mget.spec().modalities.iter().map(of).collect()
     }
@@ -393,90 +485,9 @@ fn signals(modality: &dyn Modality, clips: &[Clip]) -> Result<Vec<Signal>, Model
     clips.iter().map(of).collect()
 }
 
-/// The first round has the seed itself.
-fn seed_of_round(seed: u64, round: usize) -> u64 {
-    match round {
-        0 => seed,
-        _ => crate::random::stream(seed, "decoding.round", round as u64, 0).random(),
-    }
-}
-
-/// The mean over rounds of every clip's signal and confidence.
-#[derive(Default)]
-struct Mean {
-    rounds: usize,
-    signals: Vec<Signal>,
-    confidence: Vec<Vec<f32>>,
-}
-
-impl Mean {
-    fn add(&mut self, signals: Vec<Signal>, confidence: Vec<Vec<f32>>) {
-        self.rounds += 1;
-        if self.rounds == 1 {
-            (self.signals, self.confidence) = (signals, confidence);
-            return;
-        }
-        for (sum, signal) in self.signals.iter_mut().zip(signals) {
-            sum.values += &signal.values;
-        }
-        for (sum, values) in self.confidence.iter_mut().zip(confidence) {
-            for (sum, value) in sum.iter_mut().zip(values) {
-                *sum += value;
-            }
-        }
-    }
-
-    fn finish(mut self) -> (Vec<Signal>, Vec<Vec<f32>>) {
-        let rounds = self.rounds.max(1) as f32;
-        for signal in &mut self.signals {
-            signal.values /= rounds;
-        }
-        for value in self.confidence.iter_mut().flatten() {
-            *value /= rounds;
-        }
-        (self.signals, self.confidence)
-    }
-}
-
-/// The mean confidence of the tokens of each of `steps` time steps, spread over `samples`.
-fn per_sample(tokens: &[f32], steps: usize, samples: usize) -> Vec<f32> {
-    let each = (tokens.len() / steps.max(1)).max(1);
-    let means: Vec<f32> = tokens
-        .chunks(each)
-        .map(|chunk| chunk.iter().sum::<f32>() / chunk.len() as f32)
-        .collect();
-    let of = |sample: usize| means.get(sample * steps / samples.max(1)).copied();
-    (0..samples)
-        .map(|sample| of(sample).unwrap_or(f32::NAN))
-        .collect()
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn confidence_of_tokens_is_spread_over_samples() {
-        let tokens = [1.0, 0.0, 0.5, 0.5];
-        assert_eq!(per_sample(&tokens, 2, 6), [0.5, 0.5, 0.5, 0.5, 0.5, 0.5]);
-        assert_eq!(per_sample(&[0.25, 0.75], 2, 4), [0.25, 0.25, 0.75, 0.75]);
-    }
-
-    #[test]
-    fn rounds_are_averaged_and_the_first_has_the_seed_itself() {
-        assert_eq!(seed_of_round(7, 0), 7);
-        assert_ne!(seed_of_round(7, 1), seed_of_round(7, 2));
-        let signal = |value: f32| Signal {
-            values: ndarray::ArrayD::from_elem(vec![2, 1], value),
-            valid: None,
-        };
-        let mut mean = Mean::default();
-        mean.add(vec![signal(1.0)], vec![vec![0.5]]);
-        mean.add(vec![signal(2.0)], vec![vec![1.0]]);
-        let (signals, confidence) = mean.finish();
-        assert_eq!(signals[0].values, signal(1.5).values);
-        assert_eq!(confidence, [[0.75]]);
-    }
 
     #[test]
     fn a_folder_that_is_no_model_says_so() {

@@ -5,7 +5,7 @@ use crate::clip::Clip;
 use crate::modality::{self, ClipFormat, Modality};
 use crate::tokenizer::{TokenGrid, Tokenizer};
 use std::collections::BTreeMap;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 /// One tokenizer per modality, for clips of one format. Copies share the weights.
@@ -107,8 +107,13 @@ impl Tokenizers {
     /// # Errors
     /// When a file cannot be written.
     pub fn write(&self, folder: &Path) -> Result<(), ModelError> {
+        self.write_each(|name| folder.join(name))
+    }
+
+    /// Writes every tokenizer into the folder that `place` names for its modality.
+    pub(super) fn write_each(&self, place: impl Fn(&str) -> PathBuf) -> Result<(), ModelError> {
         for (name, tokenizer) in &self.by_modality {
-            let path = folder.join(name);
+            let path = place(name);
             std::fs::create_dir_all(&path).map_err(|error| ModelError::Io {
                 path: path.clone(),
                 error,

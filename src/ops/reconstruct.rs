@@ -13,8 +13,8 @@ use crate::experiment::{
     Problem, StageContext, StageError, StagePlan,
 };
 use crate::masking::PIXELS;
+use crate::reconstruction::floor::FloorFit;
 use crate::reconstruction::lens::LensSettings;
-use crate::reconstruction::scale::FloorFit;
 use crate::reconstruction::windows::windows;
 use crate::video::VideoSettings;
 use schemars::JsonSchema;
@@ -49,6 +49,9 @@ pub struct ReconstructSettings {
     pub targets: Vec<String>,
     /// How tokens are generated.
     pub decoding: Entry<DecodingSettings>,
+    /// How many samples are written beside the reconstruction, each from a seed of its own, with their spread; 1 writes none.
+    #[schemars(range(min = 1, max = 64))]
+    pub samples: usize,
     /// Seconds that neighbouring windows of two seconds have in common: 0.5, 1 or 1.5.
     pub overlap: f64,
     /// The camera, as far as it is known.
@@ -80,6 +83,7 @@ impl Default for ReconstructSettings {
                 name: "fast".to_owned(),
                 settings: DecodingSettings::default(),
             },
+            samples: 1,
             overlap: 1.0,
             lens: LensSettings::default(),
             floor: FloorFit::default(),
@@ -103,7 +107,7 @@ impl Op for Reconstruct {
     }
 
     fn version(&self) -> u32 {
-        5
+        6
     }
 
     fn about(&self) -> &'static str {

@@ -273,6 +273,9 @@ impl Op for Tokenize {
         let splits = splits.map(|(split, set)| ((*split).to_owned(), json!({"clips": set.len()})));
         let splits: serde_json::Map<_, _> = splits.collect();
         let mut contents = json!({ "tokens": tokens, "splits": splits, "format": format });
+        if let Some(source) = clips.contents.get("source") {
+            contents["source"] = source.clone();
+        }
         if pixels {
             contents[PIXELS] = json!([format.frames, format.size, format.size, 3]);
         }

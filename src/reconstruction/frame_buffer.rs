@@ -116,7 +116,7 @@ impl DepthFrames {
         Array2::from_shape_vec((height, width), values).map_err(std::io::Error::other)
     }
 
-    /// Writes the frames as `scale * depth + shift`, never below `lowest`, into the npz file `path` under `name`.
+    /// Writes the frames, every value as `of` makes it, into the npz file `path` under `name`.
     ///
     /// # Errors
     /// When reading or writing fails, or the file would exceed 4 GB.
@@ -124,8 +124,7 @@ impl DepthFrames {
         &self,
         path: &Path,
         name: &str,
-        [scale, shift]: [f32; 2],
-        lowest: f32,
+        of: impl Fn(f32) -> f32,
     ) -> Result<[usize; 3], FormatError> {
         let [height, width] = self.size.unwrap_or([0, 0]);
         let shape = [self.frames, height, width];
@@ -137,7 +136,7 @@ impl DepthFrames {
         member.write_all(&header(shape))?;
         for index in 0..self.frames {
             for value in self.frame(index)? {
-                member.write_all(&(scale * value + shift).max(lowest).to_le_bytes())?;
+                member.write_all(&of(value).to_le_bytes())?;
             }
         }
         let mut member = member
@@ -192,7 +191,7 @@ mod tests {
             assert!(frames.frame(3).is_err());
             let path = folder.path().join("depth.npz");
             let shape = frames
-                .write_npz(&path, "metres", [2.0, -5.0], 0.001)
+                .write_npz(&path, "metres", |value| (2.0 * value - 5.0).max(0.001))
                 .unwrap();
             assert_eq!(shape, [3, 2, 5]);
             let read = Npz::read(&path).unwrap();

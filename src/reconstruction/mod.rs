@@ -2,7 +2,7 @@
 //! (Sec. 4.1, Supp. D).
 //!
 //! [`reconstruct()`] is the whole: read [`mod@reconstruct`] (the loop), [`recording`] (what it reads), [`result`] (what it gives).
-//! Its parts are [`lens`] (the camera, given or assumed), [`windows`] (how a video is cut), [`mod@track`], [`stitch`] and [`depth`] (how windows become one), [`scale`] (metric depth from the
+//! Its parts are [`lens`] (the camera, given or assumed), [`windows`] (how a video is cut), [`mod@track`], [`stitch`] and [`depth`] (how windows become one), [`scale`] and [`floor`] (metric depth from the
 //! floor or from another model), [`predictions`] (decoded signals of single clips, for evaluation), then [`export`] (files for
 //! other programs) and [`overlay`] (the wearer drawn into the video), [`dataset`] (pictures with cameras, for view synthesis).
 
@@ -12,15 +12,20 @@ pub mod dataset;
 pub mod depth;
 mod error;
 pub mod export;
+pub mod floor;
+mod floor_view;
 pub mod folder;
 mod folder_error;
 pub mod frame_buffer;
 pub mod lens;
 pub mod overlay;
+mod parallax;
+mod picture;
 pub mod predictions;
 pub mod reconstruct;
 pub mod recording;
 pub mod result;
+pub mod samples;
 pub mod scale;
 pub mod stitch;
 pub mod track;

@@ -2,12 +2,12 @@
 
 use super::anchor;
 use super::error::ReconstructError;
+use super::floor::FloorFit;
 use super::folder::Builder;
 use super::frame_buffer::DepthFrames;
 use super::lens::LensSettings;
-use super::recording::Recording;
+use super::recording::{Recording, SYNTHETIC};
 use super::result::{Reconstruction, ReconstructionInfo};
-use super::scale::FloorFit;
 use super::stitch::follows_camera;
 use super::windows::{samples_of, windows};
 use crate::clip::{CAMERA, Clip, RGB};
@@ -18,6 +18,7 @@ use crate::masking::PIXELS;
 use crate::model::{GenerationRequest, Model};
 use crate::video::Video;
 use crate::view::Fact;
+use crate::view::scene::{Badge, Tone};
 use std::path::PathBuf;
 
 /// What is reconstructed of a recording, and how.
@@ -46,6 +47,8 @@ pub struct ReconstructOptions {
     pub anchor: Option<Anchor>,
     /// Of the decoding.
     pub seed: u64,
+    /// How many samples are given beside the reconstruction, each from a seed of its own; below two, none.
+    pub samples: usize,
 }
 
 /// Where metric depth at the frames of the model's video comes from (Supp. D).
@@ -71,6 +74,7 @@ impl Default for ReconstructOptions {
             floor: FloorFit::default(),
             anchor: None,
             seed: 0,
+            samples: 1,
         }
     }
 }
@@ -136,6 +140,25 @@ pub fn reconstruct(
     reconstruct_recording(&recording, model, options, depth, &mut |_| Flow::Continue)
 }
 
+/// Whether the model knows the synthetic world alone, and the recording is not of it.
+fn is_out_of_place(model: &Model, recording: &Recording) -> bool {
+    model.trained_on() == [SYNTHETIC] && !recording.is_synthetic()
+}
+
+/// What the model was trained on, in a sentence.
+fn trained_on(model: &Model, is_synthetic: bool) -> String {
+    match model.trained_on() {
+        [] => "its folder does not say what it was trained on".to_owned(),
+        [only] if only == SYNTHETIC && is_synthetic => {
+            "trained on the synthetic world, as this recording is".to_owned()
+        }
+        [only] if only == SYNTHETIC => "trained on the synthetic world alone; this recording is not of it, so what is \
+                                        reconstructed shows that the program runs, not what happened"
+            .to_owned(),
+        sources => format!("trained on {}", sources.join(", ")),
+    }
+}
+
 /// Reconstructs a recording. Depth is held in `depth`; `callback` hears of every part of every window.
 ///
 /// # Errors
@@ -171,6 +194,17 @@ pub fn reconstruct_recording(
             options.overlap
         ),
     });
+    let mut badges = recording.badges.clone();
+    assumptions.push(Fact {
+        label: "Model".into(),
+        value: trained_on(model, recording.is_synthetic()),
+    });
+    if is_out_of_place(model, recording) {
+        badges.push(Badge {
+            text: "model of another world".into(),
+            tone: Tone::Warn,
+        });
+    }
     let anchor = match &options.anchor {
         None => None,
         Some(Anchor::Maps(path)) => Some(anchor::read(path, frames)?),
@@ -199,7 +233,7 @@ pub fn reconstruct_recording(
         floor_fit: options.floor.clone(),
         anchor,
         assumptions,
-        badges: recording.badges.clone(),
+        badges,
         truth: recording.truth.clone(),
     };
     let mut builder = Builder::new(info, depth).with_format(&format);
@@ -226,11 +260,17 @@ pub fn reconstruct_recording(
         done(Part::Read)?;
         let mut clip = Clip::empty(format!("{}/{:06}", recording.title, window.index), "video");
         clip.set(RGB, rgb.clone());
-        let made = model.predict(&[clip], &[window.index as u64], &request)?;
+        let ids = [window.index as u64];
+        let (made, samples) = if options.samples > 1 {
+            model.predict_samples(&[clip], &ids, &request, options.samples)?
+        } else {
+            (model.predict(&[clip], &ids, &request)?, Vec::new())
+        };
         done(Part::Decode)?;
         for one in made {
             builder.push(window, rgb.frames.view(), &one.clip, &one.confidence)?;
         }
+        builder.push_samples(window, samples.iter().flatten().map(|one| &one.clip));
         done(Part::Stitch)?;
     }
     Ok(builder.finish()?)

@@ -37,7 +37,11 @@ pub struct Recording {
     /// The clip without its video.
     pub truth: Option<Clip>,
     frames: Frames,
+    is_synthetic: bool,
 }
+
+/// What clips of the built-in world say their source is, and models what they were trained on.
+pub const SYNTHETIC: &str = "world";
 
 #[derive(Debug)]
 enum Frames {
@@ -142,6 +146,7 @@ impl Recording {
             badges: Vec::new(),
             truth: None,
             frames: Frames::Video { video, start },
+            is_synthetic: false,
         })
     }
 
@@ -186,7 +191,8 @@ impl Recording {
         }
         let assumptions = vec![fact("Clip", &clip.id), lens_fact, up_fact];
         let mut badges = Vec::new();
-        if clip.source == "world" {
+        let is_synthetic = clip.source == SYNTHETIC;
+        if is_synthetic {
             badges.push(Badge {
                 text: "synthetic".to_owned(),
                 tone: Tone::Plain,
@@ -201,6 +207,7 @@ impl Recording {
             badges,
             truth: Some(clip),
             frames: Frames::Clip(rgb),
+            is_synthetic,
         })
     }
 
@@ -211,6 +218,12 @@ impl Recording {
             Frames::Video { start, .. } => *start,
             Frames::Clip(_) => 0.0,
         }
+    }
+
+    /// Whether it is of the built-in world.
+    #[must_use]
+    pub fn is_synthetic(&self) -> bool {
+        self.is_synthetic
     }
 
     /// The frames of these windows, as the model takes them.

@@ -2,9 +2,11 @@
 
 use super::depth::DepthSeam;
 use super::export::ply::Point;
+use super::floor::FloorFit;
 use super::frame_buffer::DepthFrames;
 use super::predictions::ScaleStatus;
-use super::scale::{DepthFit, FloorFit, NEAREST};
+use super::samples::spread;
+use super::scale::{DepthFit, NEAREST};
 use super::stitch::{Joints, Tracks, WindowBoundary};
 use crate::clip::clock::SIGNAL_RATE;
 use crate::clip::{Clip, Intrinsics};
@@ -53,6 +55,8 @@ pub struct Reconstruction {
     pub(super) tracks: Tracks,
     /// Of the true clip, where it is known.
     pub(super) truth: Option<Tracks>,
+    /// Where several were asked for: one after the other, each from a seed of its own.
+    pub(super) samples: Vec<Tracks>,
     pub(super) boundaries: Vec<WindowBoundary>,
     pub(super) depth: Depth,
     pub(super) confidence: BTreeMap<String, Vec<f32>>,
@@ -135,6 +139,18 @@ impl Reconstruction {
     #[must_use]
     pub fn tracks(&self) -> &Tracks {
         &self.tracks
+    }
+
+    /// What else the video allows: reconstructions from seeds of their own, without depth; empty where one was asked for.
+    #[must_use]
+    pub fn samples(&self) -> &[Tracks] {
+        &self.samples
+    }
+
+    /// How far the samples are apart, by modality.
+    #[must_use]
+    pub fn spread(&self) -> BTreeMap<&'static str, Array2<f32>> {
+        spread(&self.samples)
     }
 
     /// Depth of every video frame, and whether it is metric.
@@ -246,6 +262,11 @@ impl Depth {
         self.refused.as_deref()
     }
 
+    /// A depth as it is given out, of one as it was decoded.
+    pub(super) fn value(&self, depth: f32) -> f32 {
+        self.fit.map_or(depth.max(NEAREST), |fit| fit.apply(depth))
+    }
+
     /// How many maps there are.
     #[must_use]
     pub fn len(&self) -> usize {
@@ -264,8 +285,8 @@ impl Depth {
     /// # Errors
     /// When the disk cannot be read.
     pub fn frames(&self) -> impl Iterator<Item = std::io::Result<Array2<f32>>> + '_ {
-        let metric = |d: f32| self.fit.map_or(d.max(NEAREST), |fit| fit.apply(d));
-        (0..self.len()).map(move |index| Ok(self.frames.frame(index)?.mapv(metric)))
+        let of = |depth: f32| self.value(depth);
+        (0..self.len()).map(move |index| Ok(self.frames.frame(index)?.mapv(of)))
     }
 }
 

@@ -279,7 +279,8 @@ impl Model {
             clock: &|| 0.0,
         }
         .run::<TrainingError>(&mut |event| Ok(callback(event)))?;
-        Ok(Model::new(fitted.model, tokenizers.clone())?)
+        let model = Model::new(fitted.model, tokenizers.clone())?;
+        Ok(model.with_trained_on(vec![clips.name().to_owned()]))
     }
 }
 

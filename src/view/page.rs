@@ -1,7 +1,7 @@
 //! One HTML file from a [`Scene`].
 
 use super::cloud::quantise;
-use super::scene::{Drawing, Part, Scene, Tone, ViewError};
+use super::scene::{Drawing, Part, SAMPLE, Scene, Tone, ViewError};
 use base64::engine::general_purpose::STANDARD;
 use base64::write::EncoderWriter;
 use ndarray::Array3;
@@ -43,6 +43,7 @@ pub fn write_page(scene: &Scene, out: &mut impl Write) -> Result<(), ViewError> 
             "size": [d.metres.shape()[2], d.metres.shape()[1]], "unit": DEPTH_UNIT })),
         "cloud": cloud.as_ref().map(|c| json!({"low": c.low, "span": c.span})),
         "tracks": scene.tracks.iter().map(|t| json!({"name": t.name, "truth": t.truth,
+            "ghost": t.name.starts_with(SAMPLE),
             "parts": t.parts.iter().map(part).collect::<Vec<Value>>()})).collect::<Vec<Value>>(),
         "confidence": scene.confidence.iter().map(|c| json!({"name": c.name})).collect::<Vec<Value>>(),
     });

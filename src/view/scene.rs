@@ -126,6 +126,9 @@ pub struct DepthGrids {
     pub metres: Array3<f32>,
 }
 
+/// What names of tracks begin with that are other samples of the prediction; they are drawn faintly and toggled together.
+pub const SAMPLE: &str = "sample_";
+
 /// One version of the wearer.
 #[derive(Debug, Clone)]
 pub struct Track {

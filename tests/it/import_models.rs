@@ -7,7 +7,7 @@ use reviv::decoding::DecodingSettings;
 use reviv::engine::{Compute, Parameters, Weights};
 use reviv::import::{ImportOptions, import};
 use reviv::mget::names::to_release;
-use reviv::mget::{Mget, Size};
+use reviv::mget::{Mget, MgetSpec, ModalitySpec, Size};
 use reviv::model::{GenerationRequest, Model};
 use reviv::tokenizer::trained::VqTokenizer;
 use reviv::tokenizer::{self, Tokenizer};
@@ -241,6 +241,99 @@ pub fn small_set(folder: &Path, with_main: bool) {
         channels: 4,
     };
     released::tokenizers(folder, &spec, small);
+}
+
+/// 32 frames at 16 Hz go through the tokenizers and names of the 512 pathway, and its depth is in metres as it stands.
+#[test]
+fn the_512_pathway_reconstructs_and_its_depth_is_metric() {
+    let temporary = tempfile::tempdir().unwrap();
+    let released = temporary.path().join("metric_depth");
+    std::fs::create_dir(&released).unwrap();
+    let size = Size {
+        width: 24,
+        heads: 6,
+        encoder_depth: 1,
+        decoder_depth: 1,
+        hidden: 64,
+    };
+    let spec = released::wide_spec(size, 2, [16, 20, 24, 28]);
+    let main = released.join("reviv_main.pth");
+    released::main_model(&main, &spec, "fm_tiny_6e_6d_swiglu_nobias");
+    let small = Small {
+        width: 24,
+        depth: 1,
+        channels: 4,
+    };
+    released::tokenizers(&released, &spec, small);
+    let folder = temporary.path().join("model");
+    let files = [released.clone(), released::video(&released)];
+    import(&files, &folder, &ImportOptions::default()).unwrap();
+    let model = Model::open(&folder, &Compute::cpu()).unwrap();
+    let format = model.format();
+    assert_eq!(
+        (format.frames, format.video_rate, format.size),
+        (32, 16.0, 32)
+    );
+    let names: Vec<&str> = model.names().collect();
+    assert_eq!(
+        names,
+        [
+            "body",
+            "camera",
+            "depth",
+            "gaze",
+            "left_hand",
+            "rgb",
+            "right_hand"
+        ]
+    );
+
+    let settings = WorldSettings {
+        size: 32,
+        frames: 32,
+        video_rate: 16.0,
+        ..WorldSettings::default()
+    };
+    let clip = World::new(settings, 7).clip(0);
+    let options = reviv::reconstruction::ReconstructOptions {
+        samples: 2,
+        ..reviv::reconstruction::ReconstructOptions::default()
+    };
+    let recording =
+        reviv::reconstruction::Recording::of_clip(clip, &options.camera, format).unwrap();
+    let made = reviv::reconstruction::reconstruct_recording(
+        &recording,
+        &model,
+        &options,
+        reviv::reconstruction::frame_buffer::DepthFrames::in_memory(),
+        &mut |_| reviv::Flow::Continue,
+    )
+    .unwrap();
+    assert_eq!(made.depth().len(), 32);
+    let depth = made.depth();
+    assert!(
+        matches!(depth.scale(), reviv::reconstruction::predictions::ScaleStatus::Metric { by } if by.contains("learning")),
+        "{:?} {:?}",
+        depth.scale(),
+        depth.refused()
+    );
+    assert!(depth.fit().is_none());
+    let frame = depth.frames().next().unwrap().unwrap();
+    assert!(frame.iter().all(|d| (0.0..=15.0).contains(d)));
+    assert_eq!(made.body().positions().len(), 60);
+    assert_eq!(made.samples().len(), 2);
+    assert_eq!(made.samples()[0].body(), made.body().positions());
+    let spread = made.spread();
+    assert_eq!(spread["body"].shape(), [60, 21]);
+    assert_eq!(spread["gaze"].shape(), [60, 1]);
+
+    let again = temporary.path().join("again");
+    model.write(&again).unwrap();
+    assert!(again.join("tokenizers/rgb_512").is_dir());
+    assert_eq!(
+        *Model::open(&again, &Compute::cpu()).unwrap().format(),
+        *format
+    );
 }
 
 #[test]

@@ -124,6 +124,7 @@ fn options(settings: &ReconstructSettings, seed: u64) -> ReconstructOptions {
             (None, None) => None,
         },
         seed,
+        samples: settings.samples,
     }
 }
 

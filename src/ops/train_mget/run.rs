@@ -114,7 +114,12 @@ pub(super) fn run(
     if !root {
         return Ok(Value::Null);
     }
-    publish(&fitted, first, &settings.training, context)
+    let sources: Vec<String> = context
+        .inputs("tokens")
+        .iter()
+        .filter_map(|tokens| stated(&tokens.contents, "source").transpose())
+        .collect::<Result<_, _>>()?;
+    publish(&fitted, first, sources, &settings.training, context)
 }
 
 /// Why training ended early.
@@ -229,6 +234,7 @@ fn held_out_losses(held_out: &HeldOut, context: &mut dyn StageContext) -> Result
 fn publish(
     fitted: &FittedMget,
     tokens: &InputArtifact,
+    sources: Vec<String>,
     settings: &TrainingSettings,
     context: &mut dyn StageContext,
 ) -> Result<Value, StageError> {
@@ -246,6 +252,7 @@ fn publish(
     // The sizes of the clips the tokens were made of, where the tokens say it.
     if let Some(clips) = stated(&tokens.contents, "format")? {
         let manifest = ModelManifest::of(&output, clips).map_err(StageError::other)?;
+        let manifest = manifest.trained_on(sources);
         manifest.write(&output).map_err(StageError::other)?;
     }
     let mut made = json!({

@@ -10,9 +10,9 @@ use crate::reconstruction::export::manifest::ArrayFacts;
 use crate::reconstruction::export::ply::write_ply;
 use crate::reconstruction::predictions::ScaleStatus;
 use crate::reconstruction::result::Reconstruction;
-use crate::reconstruction::scale::NEAREST;
 use nalgebra::Point3;
 use ndarray::Array1;
+use crate::reconstruction::samples;
 use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::Path;
@@ -86,6 +86,22 @@ impl Reconstruction {
         })
     }
 
+    /// All samples and how far they spread, where there are several: `samples.npz`.
+    pub(super) fn write_samples(
+        &self,
+        path: &Path,
+        manifest: &mut Manifest,
+    ) -> Result<(), FolderError> {
+        if self.samples.is_empty() {
+            return Ok(());
+        }
+        let (npz, arrays) = samples::arrays(&self.samples);
+        npz.write(&path.join(samples::FILE))?;
+        manifest.arrays.extend(arrays);
+        manifest.files.push(samples::FILE.into());
+        Ok(())
+    }
+
     pub(super) fn write_points(
         &self,
         path: &Path,
@@ -109,21 +125,16 @@ impl Reconstruction {
         if frames.frames() == 0 {
             return Ok(());
         }
-        let (scale, shift) = manifest
-            .fit
-            .map_or((1.0, 0.0), |f| (f.scale as f32, f.shift as f32));
-        let name = if manifest.fit.is_some() {
-            "metres"
-        } else {
-            "relative"
-        };
-        let shape = frames.write_npz(&path.join("depth.npz"), name, [scale, shift], NEAREST)?;
+        let is_metric = matches!(self.depth.scale, ScaleStatus::Metric { .. });
+        let name = if is_metric { "metres" } else { "relative" };
+        let of = |depth| self.depth.value(depth);
+        let shape = frames.write_npz(&path.join("depth.npz"), name, of)?;
         manifest.files.push("depth.npz".into());
         manifest.arrays.push(ArrayFacts {
             file: "depth.npz".into(),
             name: name.into(),
             shape: shape.to_vec(),
-            unit: if manifest.fit.is_some() {
+            unit: if is_metric {
                 "m"
             } else {
                 "unknown scale and shift"

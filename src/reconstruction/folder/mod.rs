@@ -6,19 +6,21 @@ mod files;
 mod page;
 
 use self::files::write_file;
-use super::cloud::{lift, ray};
+use super::cloud::lift;
 use super::depth::{DepthSeam, DepthStitcher};
 use super::export::files::sample_of;
 use super::export::manifest::ArrayFacts;
 use super::export::ply::Point;
+use super::floor::{View, fit_floor, floor_height};
 pub use super::folder_error::FolderError;
 use super::frame_buffer::DepthFrames;
 use super::predictions::ScaleStatus;
 use super::result::{Depth, Reconstruction, ReconstructionInfo};
-use super::scale::{DepthFit, DepthRay, ScaleRefusal, fit_anchor, fit_floor, floor_height};
+use super::scale::{DepthFit, DepthSpace, ScaleRefusal, fit_anchor};
 use super::stitch::{Stitcher, Tracks, WindowBoundary, gravity_to_world};
 use super::windows::Window;
 use crate::clip::clock::SIGNAL_SAMPLES;
+use crate::clip::depth_video::{DepthCoding, DepthKind, DepthRange};
 use crate::clip::{Clip, Intrinsics};
 use crate::geometry::rigid::Rigid;
 use crate::geometry::skeleton::BODY;
@@ -68,6 +70,7 @@ pub struct Manifest {
 pub struct Builder {
     info: ReconstructionInfo,
     stitcher: Stitcher,
+    samples: Vec<Stitcher>,
     depth: DepthStitcher,
     frames: DepthFrames,
     grids: Vec<Array2<f32>>,
@@ -75,6 +78,8 @@ pub struct Builder {
     /// Colours of the frames on the depth grid, for the points.
     colors: Vec<Array3<u8>>,
     confidence: BTreeMap<String, Vec<f32>>,
+    /// What the depth of the windows means; `None`: up to scale and shift.
+    coding: Option<DepthCoding>,
 }
 
 impl Builder {
@@ -84,12 +89,14 @@ impl Builder {
         Self {
             frames,
             stitcher: Stitcher::new(info.first),
+            samples: Vec::new(),
             video: VideoFrames::new(info.video_rate),
             info,
             depth: DepthStitcher::default(),
             grids: Vec::new(),
             colors: Vec::new(),
             confidence: BTreeMap::new(),
+            coding: None,
         }
     }
 
@@ -97,6 +104,7 @@ impl Builder {
     #[must_use]
     pub fn with_format(mut self, format: &ClipFormat) -> Self {
         self.stitcher = self.stitcher.with_format(format);
+        self.coding = Some(format.depth);
         self
     }
 
@@ -139,6 +147,20 @@ impl Builder {
         Ok(())
     }
 
+    /// Adds other samples of a window: as many for every window, each beside its own of the window before.
+    pub fn push_samples<'c>(
+        &mut self,
+        window: &Window,
+        samples: impl IntoIterator<Item = &'c Clip>,
+    ) {
+        for (index, clip) in samples.into_iter().enumerate() {
+            if index == self.samples.len() {
+                self.samples.push(self.stitcher.another());
+            }
+            self.samples[index].push(window, clip);
+        }
+    }
+
     /// Fits the scale.
     ///
     /// # Errors
@@ -173,6 +195,7 @@ impl Builder {
             info: self.info,
             tracks,
             truth,
+            samples: (self.samples.into_iter().map(|s| s.finish().0)).collect(),
             boundaries,
             depth: Depth {
                 frames: self.frames,
@@ -209,6 +232,10 @@ impl Builder {
         }
         let (by, fit) = match &self.info.anchor {
             Some(anchor) => ("anchor depth", self.fit_to_anchor(anchor)),
+            None if self.is_metric() => {
+                let by = "learning from metric data".into();
+                return (ScaleStatus::Metric { by }, None, None);
+            }
             None if tracks.camera().is_empty() => ("floor fit", Err(ScaleRefusal::NoCamera)),
             None if tracks.body().is_empty() => ("floor fit", Err(ScaleRefusal::NoBody)),
             None => ("floor fit", self.fit_to_floor(tracks, floor)),
@@ -219,22 +246,32 @@ impl Builder {
         }
     }
 
+    /// Whether the model's depth has metres of its own, as that of the 512 pathway.
+    fn is_metric(&self) -> bool {
+        self.coding.is_some_and(|c| c.range == DepthRange::Fixed)
+    }
+
     fn fit_to_floor(&self, tracks: &Tracks, floor: Option<f64>) -> Result<DepthFit, ScaleRefusal> {
         let floor = floor.ok_or(ScaleRefusal::NoFeet { found: 0 })?;
-        let mut rays = Vec::new();
+        let mut views = Vec::new();
         for (frame, grid) in self.grids.iter().enumerate().step_by(self.stride()) {
-            let pose = tracks.camera()[self.sample_of(frame, tracks.camera().len())];
-            for ((row, column), &depth) in grid.indexed_iter() {
-                let [x, y] = ray(
-                    &self.info.intrinsics,
-                    [grid.nrows(), grid.ncols()],
-                    row,
-                    column,
-                );
-                rays.push(DepthRay::new(f64::from(depth), &pose, x, y));
-            }
+            let sample = self.sample_of(frame, tracks.camera().len());
+            let hands = [tracks.left_hand(), tracks.right_hand()];
+            let hands = hands.into_iter().filter_map(|hand| hand.get(sample));
+            views.push(View {
+                depth: grid.view(),
+                T_world_camera: tracks.camera()[sample],
+                hands: hands.flatten().copied().collect(),
+                picture: self.colors.get(frame).map(|colors| colors.view()),
+                second: frame as f64 / self.info.video_rate,
+            });
         }
-        fit_floor(&rays, floor, &self.info.floor_fit)
+        let space = match self.coding {
+            Some(coding) if coding.depth_kind == DepthKind::Disparity => DepthSpace::Disparity,
+            _ => DepthSpace::Depth,
+        };
+        let lens = &self.info.intrinsics;
+        fit_floor(&views, lens, floor, space, &self.info.floor_fit)
     }
 
     fn fit_to_anchor(&self, anchor: &Array3<f32>) -> Result<DepthFit, ScaleRefusal> {
@@ -327,6 +364,7 @@ impl Reconstruction {
         let mut manifest = self.manifest();
         self.write_tracks(path, &mut manifest)?;
         self.write_scene(path, &mut manifest)?;
+        self.write_samples(path, &mut manifest)?;
         self.write_points(path, &mut manifest)?;
         write_file(path, PAGE, &mut manifest.files, |out| self.write_view(out))?;
         self.write_depth(path, &mut manifest)?;

@@ -5,11 +5,15 @@ use crate::clip::clock::SIGNAL_RATE;
 use crate::reconstruction::depth::stack;
 use crate::reconstruction::predictions::ScaleStatus;
 use crate::reconstruction::result::Reconstruction;
+use crate::reconstruction::samples::mean_of;
 use crate::reconstruction::stitch::{Tracks, WindowBoundary};
 use crate::reconstruction::track::Timeline;
-use crate::view::scene::Tone;
+use crate::view::scene::{SAMPLE, Tone};
 use crate::view::{Badge, Confidence, DepthGrids, Fact, Part, Scene, Track};
 use ndarray::Array2;
+
+/// Samples that the page draws beside the reconstruction; the file has all of them.
+const GHOSTS: usize = 8;
 
 impl Reconstruction {
     pub(super) fn page(&self, manifest: &Manifest) -> Scene {
@@ -32,8 +36,10 @@ impl Reconstruction {
         ));
         if let Some(fit) = &manifest.fit {
             let value = format!(
-                "depth x {:.3} + {:.3} m, residual {:.3} m over {} points",
-                fit.scale, fit.shift, fit.residual, fit.points
+                "{}, residual {:.3} m over {} points",
+                fit.words(),
+                fit.residual,
+                fit.points
             );
             facts.push(fact("Scale fit", &value));
         }
@@ -42,15 +48,33 @@ impl Reconstruction {
         }
         for (name, value) in &manifest.confidence {
             facts.push(fact(
-                &format!("Confidence, {name}"),
-                &format!("{value:.2} (token entropy)"),
+                &format!("Token certainty, {name}"),
+                &format!("{value:.2} (1 less the entropy of the tokens; not an accuracy)"),
             ));
+        }
+        for (name, values) in self.spread() {
+            let Some(mean) = mean_of(&values) else {
+                continue;
+            };
+            let n = self.samples.len();
+            let value = if name == "gaze" {
+                format!("{:.1} % of the image over {n} samples", 100.0 * mean)
+            } else {
+                format!("{:.0} mm over {n} samples", 1000.0 * mean)
+            };
+            facts.push(fact(&format!("Spread, {name}"), &value));
         }
         if let Some(seam) = worst_seam(&manifest.seams) {
             facts.push(fact("Largest seam", &seam));
         }
         let samples = self.info.samples;
         let mut list = vec![track_of("prediction", false, &self.tracks, samples)];
+        let others = self.samples.iter().take(GHOSTS).enumerate();
+        list.extend(others.map(|(k, sample)| {
+            let mut ghost = track_of(&format!("{SAMPLE}{k}"), false, sample, samples);
+            ghost.parts.retain(|part| part.modality != "gaze");
+            ghost
+        }));
         if let Some(truth) = &self.truth {
             list.push(track_of("truth", true, truth, samples));
         }

@@ -13,11 +13,12 @@ const layers = [
   { id: "depth", key: "d", label: "Depth now", color: [0.6, 0.66, 0.74], has: () => !!depth },
   { id: "cloud", key: "w", label: "World", color: [0.45, 0.5, 0.6], has: () => !!cloud },
   { id: "truth", key: "t", label: "Truth (stippled)", color: [0.8, 0.8, 0.8], has: () => tracks.some(t => t.truth) },
+  { id: "samples", key: "s", label: "Other samples (faint)", color: [0.6, 0.6, 0.6], has: () => tracks.some(t => t.ghost) },
 ].filter(l => l.has()).map(l => ({ ...l, on: true }));
 const shown = id => layers.some(l => l.id === id && l.on);
 
 const state = { sample: 0, playing: false, speed: 1, camera: "orbit", yaw: -0.6, pitch: 0.42, distance: 4.2, target: [0, 0.6, -0.7], dirty: true, clock: 0 };
-const visibleTracks = () => tracks.filter(t => !t.truth || shown("truth"));
+const visibleTracks = () => tracks.filter(t => (!t.truth || shown("truth")) && (!t.ghost || shown("samples")));
 const main = tracks.find(t => !t.truth) || tracks[0];
 const touch = () => { state.dirty = true; };
 
@@ -73,7 +74,7 @@ const draw = {
   plot() {},
 };
 function drawTrack(track, sample) {
-  for (const part of track.parts) if (shown(part.layer)) draw[part.kind](track, part, sample, colorOf(part), track.truth ? 0.5 : 1);
+  for (const part of track.parts) if (shown(part.layer)) draw[part.kind](track, part, sample, colorOf(part), track.truth ? 0.5 : track.ghost ? 0.22 : 1);
 }
 function drawFloor() {
   const z = manifest.floor; if (z == null) return;
@@ -140,7 +141,7 @@ function project(track, part, size) {
 
 // ---- curves of what has no place in the scene -------------------------------------------------------------------------
 
-const plots = names.map(layer => ({ layer, parts: tracks.flatMap(t => t.parts.filter(p => p.layer === layer && p.kind === "plot").map(p => ({ ...p, truth: t.truth }))) })).filter(p => p.parts.length);
+const plots = names.map(layer => ({ layer, parts: tracks.flatMap(t => t.parts.filter(p => p.layer === layer && p.kind === "plot" && !t.ghost).map(p => ({ ...p, truth: t.truth }))) })).filter(p => p.parts.length);
 for (const plot of plots) {
   const [{ channels, units, width }] = plot.parts;
   let [low, high] = [Infinity, -Infinity];
@@ -237,7 +238,7 @@ function drawConfidence() {
       pen.fillRect(x, k * row, 1, row - 1);
     }
   });
-  strip.title = "Confidence from token entropies, top to bottom: " + confidence.map(c => c.name).join(", ");
+  strip.title = "Token certainty (1 less the entropy, not an accuracy), top to bottom: " + confidence.map(c => c.name).join(", ");
 }
 
 function clockText(s) { const m = Math.floor(s / 60); return `${m}:${(s - 60 * m).toFixed(2).padStart(5, "0")}`; }

@@ -121,7 +121,10 @@ impl Modality for Depth {
         vec![format!("{kind}, -1 to 1 over {range}")]
     }
     fn lengths(&self) -> Lengths {
-        Lengths::Relative
+        match self.coding.range {
+            depth_video::DepthRange::Fixed => Lengths::Metric,
+            depth_video::DepthRange::ClipMinmax => Lengths::Relative,
+        }
     }
     fn frame(&self) -> &'static str {
         "image"
