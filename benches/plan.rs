@@ -19,9 +19,9 @@ about: Trainings that are planned and measured.
 seed: 0
 stages:
   clips: {op: clips, source: world_small, train: 64, validation: 8, test: 8}
-  tok_rgb: {op: train_tokenizer, clips: clips, modality: rgb, tokenizer: video_tiny, steps: 2, batch: 2}
-  tok_body: {op: train_tokenizer, clips: clips, modality: body, tokenizer: vq_kinematic_small, steps: 2, batch: 8}
-  tok_camera: {op: train_tokenizer, clips: clips, modality: camera, tokenizer: vq_temporal_small, steps: 2, batch: 8}
+  tok_rgb: {op: train_tokenizer, clips: clips, modality: rgb, tokenizer: video_tiny, warmup: {steps: 1}, steps: 2, batch: 2}
+  tok_body: {op: train_tokenizer, clips: clips, modality: body, tokenizer: vq_kinematic_small, warmup: {steps: 1}, steps: 2, batch: 8}
+  tok_camera: {op: train_tokenizer, clips: clips, modality: camera, tokenizer: vq_temporal_small, warmup: {steps: 1}, steps: 2, batch: 8}
   tokens: {op: tokenize, clips: clips, tokenizers: [tok_rgb, tok_body, tok_camera], pixels: rgb}
 ";
 
@@ -37,7 +37,7 @@ fn trainings(quick: bool) -> Vec<(String, String)> {
             let stage = format!(
                 "  it: {{op: train_mget, tokens: [tokens], size: {{use: laptop, width: {width}, heads: {heads}, encoder_depth: {depth}, \
                  decoder_depth: {depth}}}, masking: {{use: dirichlet_mixture, input_tokens: 256, target_tokens: 256}}, pixels: rgb, \
-                 tubelet: [4, 16, 16], steps: {STEPS}, batch: {batch}}}\n"
+                 tubelet: [4, 16, 16], warmup: {{steps: 1}}, steps: {STEPS}, batch: {batch}}}\n"
             );
             all.push((format!("MGET {size}, batch {batch}"), stage));
         }
@@ -46,7 +46,7 @@ fn trainings(quick: bool) -> Vec<(String, String)> {
         for batch in if quick { &[32][..] } else { &[8, 64, 256][..] } {
             let stage = format!(
                 "  it: {{op: train_tokenizer, clips: clips, modality: body, tokenizer: {{use: vq_kinematic_small, width: {width}, \
-                 depth: {depth}}}, steps: {STEPS}, batch: {batch}}}\n"
+                 depth: {depth}}}, warmup: {{steps: 1}}, steps: {STEPS}, batch: {batch}}}\n"
             );
             all.push((format!("joints {size}, batch {batch}"), stage));
         }
@@ -55,7 +55,7 @@ fn trainings(quick: bool) -> Vec<(String, String)> {
         for batch in if quick { &[2][..] } else { &[1, 4, 8][..] } {
             let stage = format!(
                 "  it: {{op: train_tokenizer, clips: clips, modality: rgb, tokenizer: {{use: video_tiny, channels: {channels}}}, \
-                 steps: {STEPS}, batch: {batch}}}\n"
+                 warmup: {{steps: 1}}, steps: {STEPS}, batch: {batch}}}\n"
             );
             all.push((format!("video {size}, batch {batch}"), stage));
         }

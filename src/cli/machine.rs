@@ -26,7 +26,7 @@ const FILE: &str = "machine.json";
 const SIDE: usize = 256;
 /// Seconds that each measurement takes.
 const LONG: f64 = 0.1;
-/// Of the products per second, what a training step reaches where no run has shown it.
+/// How many times longer a training takes than its products alone, where no run has shown it: an estimate.
 const USUAL: f64 = 3.0;
 
 impl Machine {

@@ -10,9 +10,9 @@ const F32: f64 = 4.0;
 /// Copies of every parameter: the value, its gradient and two moments.
 const COPIES: f64 = 4.0;
 /// Gradients of activations that live at once, blocks of the allocator that are larger than what was asked for, and what it keeps
-/// for the next step, as a share of what the forward pass leaves: measured by `cargo bench --bench plan`.
+/// for the next step, as a share of what the forward pass leaves: an estimate, which `cargo bench --bench plan` puts to the test.
 const BACKWARD: f64 = 1.25;
-/// The program, its threads and its buffers: measured by the same bench.
+/// The program, its threads and its buffers: an estimate, likewise.
 const PROGRAM: f64 = 48e6;
 
 /// Peak bytes of a training with so many parameters, whose forward pass leaves `floats` numbers per step.
