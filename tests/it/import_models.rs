@@ -243,6 +243,19 @@ pub fn small_set(folder: &Path, with_main: bool) {
     released::tokenizers(folder, &spec, small);
 }
 
+/// A model of the 512 pathway, with the video of both: 32 frames and `16 * side` pixels a side.
+fn wide_spec(size: Size, side: usize, vocabularies: [usize; 4]) -> MgetSpec {
+    let mut spec = released::spec(size, [5, side, side], vocabularies);
+    let grid = [5, side, side];
+    spec.modalities.extend([
+        ModalitySpec::tokens("depth_512", &grid, 64_000),
+        ModalitySpec::pixels("pixels_512", [32, 16 * side, 16 * side, 3], [8, 16, 16]),
+        ModalitySpec::tokens("rgb_512", &grid, 64_000),
+    ]);
+    spec.modalities.sort_by(|a, b| a.name.cmp(&b.name));
+    spec
+}
+
 /// 32 frames at 16 Hz go through the tokenizers and names of the 512 pathway, and its depth is in metres as it stands.
 #[test]
 fn the_512_pathway_reconstructs_and_its_depth_is_metric() {
@@ -256,7 +269,7 @@ fn the_512_pathway_reconstructs_and_its_depth_is_metric() {
         decoder_depth: 1,
         hidden: 64,
     };
-    let spec = released::wide_spec(size, 2, [16, 20, 24, 28]);
+    let spec = wide_spec(size, 2, [16, 20, 24, 28]);
     let main = released.join("reviv_main.pth");
     released::main_model(&main, &spec, "fm_tiny_6e_6d_swiglu_nobias");
     let small = Small {

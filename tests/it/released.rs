@@ -31,19 +31,6 @@ pub fn spec(size: Size, video: [usize; 3], vocabularies: [usize; 4]) -> MgetSpec
     }
 }
 
-/// A model of the 512 pathway, with the video of both: 32 frames and `16 * side` pixels a side.
-pub fn wide_spec(size: Size, side: usize, vocabularies: [usize; 4]) -> MgetSpec {
-    let mut spec = spec(size, [5, side, side], vocabularies);
-    let grid = [5, side, side];
-    spec.modalities.extend([
-        ModalitySpec::tokens("depth_512", &grid, 64_000),
-        ModalitySpec::pixels("pixels_512", [32, 16 * side, 16 * side, 3], [8, 16, 16]),
-        ModalitySpec::tokens("rgb_512", &grid, 64_000),
-    ]);
-    spec.modalities.sort_by(|a, b| a.name.cmp(&b.name));
-    spec
-}
-
 /// Numbers of about 0.02 that depend on the name and the place.
 fn noise(name: &str, count: usize) -> Vec<f32> {
     let mut state = name.bytes().fold(0x9e37_79b9_7f4a_7c15_u64, |h, b| {
