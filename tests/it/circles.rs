@@ -78,8 +78,13 @@ fn paths(prefix: &[String], tree: &str, found: &mut Vec<Vec<String>>) {
 /// The paths that a text's `use` lines and expressions name.
 fn named(code: &str) -> Vec<Vec<String>> {
     let mut found = Vec::new();
-    for piece in code.split("use ").skip(1) {
-        if let Some((tree, _)) = piece.split_once(';') {
+    for (at, keyword) in code.match_indices("use ") {
+        // `refuse =` and words in messages are no declarations.
+        let before = code[..at].rsplit('\n').next().unwrap_or("").trim();
+        if !["", "pub", "pub(crate)", "pub(super)"].contains(&before) {
+            continue;
+        }
+        if let Some((tree, _)) = code[at + keyword.len()..].split_once(';') {
             paths(&[], tree, &mut found);
         }
     }
