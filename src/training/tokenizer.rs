@@ -17,7 +17,7 @@ use super::validation::Score;
 use crate::clip::Signal;
 use crate::engine::communicator::reduce::Reduction;
 use crate::engine::parameters::to_host;
-use crate::engine::{Communicator, Gradients, Parameters, RankError};
+use crate::engine::{Communicator, Gradients, Parameters};
 use crate::geometry::skeleton::HAND;
 use crate::random::stream;
 use crate::tokenizer::quantizer::Assignment;
@@ -202,7 +202,7 @@ impl VqReconstruction {
         &self,
         signals: &[Prepared],
         ranks: &Communicator,
-    ) -> Result<BTreeMap<String, Score>, RankError> {
+    ) -> Result<BTreeMap<String, Score>, TrainingError> {
         let model = self.model.frozen();
         let chunks: Vec<&[Prepared]> = signals.chunks(HELD_OUT).collect();
         let losses = ranks.map(chunks.len(), |index| {
@@ -211,7 +211,7 @@ impl VqReconstruction {
             let found = model.decode(&model.encode(&batch), chunk.len());
             // As bits: a loss need not be a number.
             let loss = to_host(model.loss(found, &batch))[0];
-            Ok::<_, RankError>((loss.to_bits(), chunk.len()))
+            Ok::<_, TrainingError>((loss.to_bits(), chunk.len()))
         })?;
         let losses = losses.into_iter();
         Ok(mean_of(

@@ -160,10 +160,7 @@ impl TokenizerFit<'_> {
                 let chosen = epochs.choose(step, micro, prepared.len())?;
                 Ok(chosen.into_iter().map(|i| prepared[i].clone()).collect())
             },
-            |objective| {
-                let losses = objective.held_out(&held_out, &self.ranks);
-                Ok(losses.map_err(TrainingError::from)?)
-            },
+            |objective| Ok(objective.held_out(&held_out, &self.ranks)?),
             callback,
         )?;
         let tokenizer = VqTokenizer::new(self.modality, shape, normaliser.clone(), trainer.model())
