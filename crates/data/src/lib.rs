@@ -7,6 +7,7 @@
 //! A crate of its own, so that an edit above it compiles nothing of it again. `reviv` re-exports every room under its own name.
 // Transforms are named `T_to_from`, tensors carry shape suffixes (`x_BND`): the field's own notation.
 #![allow(non_snake_case)]
+#![warn(missing_docs)]
 
 pub mod clip;
 pub mod datasets;
