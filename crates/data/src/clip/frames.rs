@@ -12,16 +12,28 @@ pub const MIN_HORIZONTAL: f64 = 0.1;
 /// Why a clip has no gravity frame, or joints do not fit a camera track.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum FrameError {
+    /// The track has no `up_world`, so that nothing says where gravity points.
     #[error("the camera track does not know which way is up")]
     NoUp,
+    /// The track has no pose, or its first one is not valid: there is nothing to put the gravity frame at.
     #[error("the first camera pose is missing or invalid")]
     NoFirstPose,
+    /// The head is tilted sideways so far that the frame has no heading.
     #[error(
         "the first camera's right axis is nearly vertical (horizontal part {horizontal:.3}): the gravity frame is undefined"
     )]
-    Degenerate { horizontal: f64 },
+    Degenerate {
+        /// Length of the right axis's projection onto the ground, below [`MIN_HORIZONTAL`]; NaN for a pose that is not finite.
+        horizontal: f64,
+    },
+    /// Joints and camera track differ in length: they do not have the samples of one clock.
     #[error("{joints} samples of joints but {poses} camera poses")]
-    Length { joints: usize, poses: usize },
+    Length {
+        /// Samples of the joints.
+        joints: usize,
+        /// Poses of the camera track.
+        poses: usize,
+    },
 }
 
 /// `T_gravity_world` of a first camera: origin at the camera's centre, z up, x the horizontal part of the camera's right

@@ -20,28 +20,46 @@ pub const TOKENS_PER_SHARD: usize = 1000;
 /// Why shards cannot be read or written.
 #[derive(Debug, thiserror::Error)]
 pub enum ShardError {
+    /// The operating system refuses to make, open, list, read or write a file or a folder.
     #[error("{}: {error}", path.display())]
     Io {
+        /// The file or folder it refuses.
         path: PathBuf,
+        /// What it says.
         #[source]
         error: std::io::Error,
     },
+    /// A member has a name that is no relative path, is there twice, or cannot be read as what it should hold.
     #[error("{}: member `{member}`: {reason}", path.display())]
     Member {
+        /// The tar; the folder where a name is refused before there is one.
         path: PathBuf,
+        /// The stem of the member: the id of the sample.
         member: String,
+        /// What is wrong with it.
         reason: String,
     },
+    /// The file is no tar, is cut off, or has a member that is neither `.npz` nor `.npy`.
     #[error("{}: byte {offset}: {reason}", path.display())]
     Tar {
+        /// The tar.
         path: PathBuf,
+        /// Bytes from the start of the tar: where the contents of the member begin, or those of the last one before the damage.
         offset: u64,
+        /// What is wrong there.
         reason: String,
     },
+    /// A folder is opened below which no tar lies where shards do.
     #[error("{}: no shards below it", .0.display())]
     Empty(PathBuf),
+    /// A sample is asked for beyond the last one.
     #[error("no sample number {index}; there are {count}")]
-    NoSample { index: usize, count: usize },
+    NoSample {
+        /// The number that was asked for, from 0.
+        index: usize,
+        /// How many samples the shards have.
+        count: usize,
+    },
 }
 
 fn io(path: &Path) -> impl FnOnce(std::io::Error) -> ShardError + '_ {

@@ -17,6 +17,7 @@ pub trait ClipSource: Send + Sync {
     /// How many clips there are, those that [`ClipSource::clip`] drops included.
     fn len(&self) -> usize;
 
+    /// Whether there is no clip, not even one that [`ClipSource::clip`] would drop.
     fn is_empty(&self) -> bool {
         self.len() == 0
     }
@@ -84,6 +85,7 @@ pub trait ClipSource: Send + Sync {
 /// A recording that gives no clips.
 #[derive(Debug, Clone, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 pub struct Excluded {
+    /// Its name within the data set.
     pub recording: String,
     /// One sentence that names the file.
     pub reason: String,
@@ -98,6 +100,7 @@ pub enum Outcome {
     Dropped {
         /// The id the clip would have had.
         id: String,
+        /// Why the recording does not allow it.
         reason: DropReason,
     },
 }

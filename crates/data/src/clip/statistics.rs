@@ -13,6 +13,7 @@ pub struct SignalStatistics {
     pub without: u64,
     /// Samples (of every joint, of every pixel) and how many of them are valid.
     pub samples: u64,
+    /// Those of [`SignalStatistics::samples`] that are valid.
     pub valid: u64,
     /// By channel: the last axis of the signal.
     pub channels: Vec<ChannelStatistics>,
@@ -21,13 +22,17 @@ pub struct SignalStatistics {
 /// Statistics of one channel over the valid samples.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct ChannelStatistics {
+    /// Unit of the values, as the modality names it; empty where it names none.
     pub unit: String,
     /// Valid and finite values.
     pub count: u64,
+    /// Mean of the counted values, in their unit; 0 where there are none.
     pub mean: f64,
     /// Population standard deviation.
     pub std: f64,
+    /// Smallest counted value; 0 where there are none.
     pub min: f64,
+    /// Largest counted value; 0 where there are none.
     pub max: f64,
     /// Sum of squared deviations from the mean (Welford).
     #[serde(skip)]

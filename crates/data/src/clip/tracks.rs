@@ -75,11 +75,17 @@ pub struct CameraTrack {
 /// Pinhole intrinsics in pixels; the centre of the top-left pixel is (0, 0).
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct Intrinsics {
+    /// Focal length along x, pixels.
     pub fx: f64,
+    /// Focal length along y, pixels.
     pub fy: f64,
+    /// Column of the principal point, pixels.
     pub cx: f64,
+    /// Row of the principal point, pixels.
     pub cy: f64,
+    /// Of the frames, pixels.
     pub width: u32,
+    /// Of the frames, pixels.
     pub height: u32,
 }
 

@@ -31,6 +31,7 @@ pub trait Value: Debug + Clone + PartialEq + Send + Sync + 'static {
 pub struct Arrays {
     /// What messages call the values; their validity is `<name>_valid`.
     pub name: String,
+    /// The main array: frames, poses, joints or channels. A shard stores it as [`Value::VALUES`].
     pub values: NpyArray,
     /// Which values are known: the shape of the values without their last axes. `None` means all.
     pub valid: Option<NpyArray>,

@@ -159,15 +159,18 @@ impl Tally {
 pub struct Progress {
     /// Indices that are done, those of finished shards included.
     pub done: usize,
+    /// Indices of this process's share, dropped clips included.
     pub total: usize,
 }
 
 /// The result of a conversion.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Converted {
+    /// Shards of this process's share; where it was interrupted, those not made yet count too.
     pub shards: usize,
     /// Shards that an earlier attempt had made.
     pub reused: usize,
+    /// What became of the clips of the finished shards, reused ones included.
     pub tally: Tally,
     /// It was asked to stop before the end; calling again goes on.
     pub interrupted: bool,

@@ -42,6 +42,7 @@ const DEPTH_RANGE: f32 = 15.0;
 pub struct GazeSpace {
     /// The picture in whose pixels gaze is written.
     pub width: u32,
+    /// Height of that picture, pixels.
     pub height: u32,
     /// Side of the centre square that clips show.
     pub crop: u32,

@@ -108,7 +108,9 @@ pub enum HandModel {
     /// UmeTrack where the wearer's profile is there, else MANO.
     #[default]
     Auto,
+    /// UmeTrack; needs the wearer's profile, which is part of the recording: without it there are no hands.
     Umetrack,
+    /// MANO; needs the user's licensed model files: without them there are no hands.
     Mano,
 }
 

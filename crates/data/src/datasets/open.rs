@@ -21,6 +21,7 @@ pub struct OpenWith<'a> {
     pub declared: &'a [DeclaredSettings],
     /// The folder of the user's `MANO_LEFT.pkl` and `MANO_RIGHT.pkl`, for sets whose hands are MANO parameters.
     pub mano: Option<&'a Path>,
+    /// Which model gives hands their joints, for sets that have the parameters of both (clips of HOT3D).
     pub hands: HandModel,
 }
 

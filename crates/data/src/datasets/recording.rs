@@ -81,6 +81,7 @@ pub trait DepthFrames: Send + Sync {
 pub struct MountedCamera {
     /// For the pictures as stored.
     pub camera: Camera,
+    /// From the camera's `OpenCV` axes (of the picture as stored) to the device's, metres.
     pub T_device_camera: Isometry3<f64>,
 }
 
@@ -114,10 +115,13 @@ impl MountedCamera {
 pub struct Recording {
     /// Within the data set; clips are `source/id/000012`.
     pub id: String,
+    /// The data set: `adt`, `hot3d_aria`, ...
     pub source: String,
     /// From the stored picture to the upright one.
     pub turn: Turn,
+    /// The pictures that clips show; `None` where there are none.
     pub colour: Option<Box<dyn ColourFrames>>,
+    /// Depth along the optical axis; `None` where there is none.
     pub depth: Option<Box<dyn DepthFrames>>,
     /// When clips begin and end if there are no pictures at hand.
     pub span: Option<(i64, i64)>,
@@ -125,10 +129,13 @@ pub struct Recording {
     pub cameras: Vec<(i64, MountedCamera)>,
     /// `T_world_device`.
     pub device: Option<Track<Isometry3<f64>>>,
+    /// Against gravity in the world, unit length; `None` where it is not known: there is no body then.
     pub up_world: Option<Unit<Vector3<f64>>>,
+    /// Where the wearer looks over time.
     pub gaze: Option<Track<GazeSample>>,
     /// Left and right, in `hands_frame`.
     pub hands: [Option<Track<Joints>>; 2],
+    /// What the coordinates of `hands` refer to.
     pub hands_frame: JointFrame,
     /// In the world.
     pub body: Option<Track<Joints>>,
@@ -150,6 +157,7 @@ impl std::fmt::Debug for Recording {
 /// What the coordinates of hands refer to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum JointFrame {
+    /// The world of the device's poses.
     #[default]
     World,
     /// The upright camera of the same moment.
@@ -162,7 +170,12 @@ pub enum GazeSample {
     /// A direction from the central pupil frame of Aria glasses.
     Aria(super::aria::gaze::Gaze, Isometry3<f64>),
     /// A pixel of the upright picture, and that picture's width and height.
-    Pixel { pixel: [f64; 2], size: [f64; 2] },
+    Pixel {
+        /// Column and row, in pixels of a picture of `size`.
+        pixel: [f64; 2],
+        /// Width and height in pixels, which need not be those of the stored picture.
+        size: [f64; 2],
+    },
 }
 
 impl super::track::Blend for GazeSample {

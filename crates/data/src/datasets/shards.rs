@@ -68,6 +68,7 @@ impl From<ShardError> for ReadError {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Marker {
+    /// What became of the shard's clips.
     pub tally: Tally,
     /// The shard's files below the root, by path.
     pub files: BTreeMap<String, Content>,
@@ -77,7 +78,9 @@ pub struct Marker {
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Content {
+    /// Its size.
     pub bytes: u64,
+    /// The BLAKE3 hash of its bytes, in hexadecimal.
     pub blake3: String,
 }
 

@@ -11,10 +11,13 @@ use std::collections::BTreeMap;
 pub struct Status {
     /// The data set's own name, which clips carry.
     pub source: String,
+    /// Recordings that can be read.
     pub recordings: usize,
+    /// Clips that can be asked for, those that will be dropped included.
     pub clips: usize,
     /// Of the clips, at their stride.
     pub hours: f64,
+    /// What its clips can have, by registry name.
     pub modalities: Vec<String>,
     /// `train`, `validation`, `test`.
     pub splits: Vec<Share>,
@@ -27,8 +30,11 @@ pub struct Status {
 /// The recordings of one split.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Share {
+    /// `train`, `validation` or `test`.
     pub split: &'static str,
+    /// Recordings that the split has.
     pub recordings: usize,
+    /// Clips of those recordings.
     pub clips: usize,
     /// What comes before the first `_`, `-` or `/` of their names, with its number of recordings: the participant in most data sets.
     pub groups: BTreeMap<String, usize>,

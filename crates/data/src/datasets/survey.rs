@@ -12,10 +12,13 @@ use std::ops::ControlFlow;
 /// What was found.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Survey {
+    /// The data set's own name, which clips carry.
     pub source: String,
     /// Clips there are, dropped ones included, and how many were looked at.
     pub clips: usize,
+    /// How many of them were looked at: fewer than asked for where it was interrupted.
     pub looked_at: usize,
+    /// Recordings that can be read.
     pub recordings: usize,
     /// Recordings that give no clips, with the reason.
     pub excluded: Vec<Excluded>,
@@ -23,8 +26,11 @@ pub struct Survey {
     pub notes: Vec<(String, usize)>,
     /// What reads the videos, with the number of recordings.
     pub decoders: Vec<(String, usize)>,
+    /// Sizes of its clips; of the first one where the source does not say them.
     pub format: ClipFormat,
+    /// What became of the clips that were looked at.
     pub tally: Tally,
+    /// What those of them hold that were not dropped.
     pub inventory: Inventory,
     /// Clips spread over those that were looked at.
     #[serde(skip)]

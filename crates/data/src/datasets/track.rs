@@ -80,16 +80,19 @@ impl<T: Blend> Track<T> {
         }
     }
 
+    /// When the samples were taken: nanoseconds, ascending, each once.
     #[must_use]
     pub fn times(&self) -> &[i64] {
         &self.times
     }
 
+    /// The samples, in the order of [`Track::times`].
     #[must_use]
     pub fn values(&self) -> &[T] {
         &self.values
     }
 
+    /// Whether there is no sample.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.times.is_empty()
@@ -163,6 +166,7 @@ impl ClockMap {
         (!pairs.is_empty()).then_some(ClockMap { pairs })
     }
 
+    /// A time of the first clock on the second one, both in nanoseconds.
     #[must_use]
     pub fn map(&self, time: i64) -> i64 {
         let after = self.pairs.partition_point(|pair| pair.0 <= time);

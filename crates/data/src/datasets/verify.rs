@@ -15,8 +15,11 @@ use std::path::Path;
 pub struct Verified {
     /// Shards that the conversion has, and those that are finished.
     pub shards: usize,
+    /// Those of them that are finished.
     pub finished: usize,
+    /// Files of the finished shards, missing ones included.
     pub files: usize,
+    /// What those files have now; a missing one has none.
     pub bytes: u64,
     /// What became of the clips of the finished shards.
     pub tally: Tally,

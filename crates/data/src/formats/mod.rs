@@ -23,35 +23,55 @@ pub enum FormatError {
     /// The bytes are not what the format prescribes, or more than this reader accepts.
     #[error("{format}: byte {offset}: {reason}")]
     Malformed {
+        /// The format in which it was read: `npy`, `zip`, `png`, ...
         format: &'static str,
         /// From the start of the file (or of the uncompressed member, where the format lies inside an archive).
         offset: u64,
+        /// What is wrong there.
         reason: String,
     },
     /// The array is fine, but its values do not fit what was asked for.
     #[error("{reason}")]
-    Conversion { reason: String },
+    Conversion {
+        /// Which value does not fit, and into what.
+        reason: String,
+    },
     /// The archive has no member of this name.
     #[error("no `{name}` in the archive; it holds {present}")]
-    Missing { name: String, present: String },
+    Missing {
+        /// The member that was asked for.
+        name: String,
+        /// The names of its first members, joined by commas, or `nothing`.
+        present: String,
+    },
+    /// The operating system refuses to read or write.
     #[error("{0}")]
     Io(#[from] std::io::Error),
     /// A file was expected.
     #[error("{kind}, and no regular file")]
-    NotAFile { kind: &'static str },
+    NotAFile {
+        /// What is there: `a folder` or `a pipe or a device`.
+        kind: &'static str,
+    },
     /// More bytes than are held in memory.
     #[error("more than {limit} bytes")]
-    TooLarge { limit: u64 },
+    TooLarge {
+        /// The most bytes that the reader takes.
+        limit: u64,
+    },
     /// Any of the above, with the file it happened in.
     #[error("{}: {source}", path.display())]
     File {
+        /// The file.
         path: PathBuf,
+        /// What happened in it.
         #[source]
         source: Box<FormatError>,
     },
 }
 
 impl FormatError {
+    /// A [`FormatError::Malformed`] at byte `offset`.
     pub fn malformed(format: &'static str, offset: u64, reason: impl Into<String>) -> Self {
         Self::Malformed {
             format,
@@ -60,6 +80,7 @@ impl FormatError {
         }
     }
 
+    /// The same error with its file; an error that has one keeps it.
     pub fn in_file(self, path: &Path) -> Self {
         match self {
             Self::File { .. } => self,

@@ -10,6 +10,7 @@ use std::path::Path;
 /// Named arrays, in the order of their names.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Npz {
+    /// By name: the member without `.npy`.
     pub arrays: BTreeMap<String, NpyArray>,
 }
 

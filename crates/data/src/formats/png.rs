@@ -8,8 +8,11 @@ use std::path::Path;
 /// A picture as `[height, width]` or `[height, width, 3]`.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Picture {
+    /// Grey of 8 bits, `[height, width]`.
     Grey8(Array2<u8>),
+    /// Grey of 16 bits, `[height, width]`: depth maps.
     Grey16(Array2<u16>),
+    /// Red, green and blue of 8 bits each, `[height, width, 3]`.
     Rgb8(Array3<u8>),
 }
 

@@ -33,31 +33,54 @@ pub enum ReadError {
     /// The operating system says no.
     #[error("`{}`: {cause}", path.display())]
     Io {
+        /// The file or folder it refuses.
         path: PathBuf,
+        /// What it says.
         #[source]
         cause: std::io::Error,
     },
     /// The file is not what it claims to be: truncated, damaged or hostile.
     #[error("`{}`{place}: {reason}", path.display())]
     Malformed {
+        /// The file.
         path: PathBuf,
+        /// Where in it, as far as that is known.
         place: Position,
+        /// What is wrong there.
         reason: String,
     },
     /// The file is fine, but of a kind that is not read here; the reason says what to do instead.
     #[error("`{}`: {reason}", path.display())]
-    Unsupported { path: PathBuf, reason: String },
+    Unsupported {
+        /// The file.
+        path: PathBuf,
+        /// What it is, and what to do instead.
+        reason: String,
+    },
     /// A file or a part of it that is needed is not there.
     #[error("`{}`: {reason}", path.display())]
-    Missing { path: PathBuf, reason: String },
+    Missing {
+        /// The file or folder that is not there, or that lacks something.
+        path: PathBuf,
+        /// What is not there.
+        reason: String,
+    },
     /// Nothing of the kind that was looked for is here; something of another kind may be.
     #[error("`{}`: {reason}", path.display())]
-    Absent { path: PathBuf, reason: String },
+    Absent {
+        /// The file or folder that was looked into.
+        path: PathBuf,
+        /// What was looked for.
+        reason: String,
+    },
     /// An index beyond the end.
     #[error("clip {index} of `{source_name}`, which has {len}")]
     OutOfRange {
+        /// Whose index it is: a data set, a recording, or a stream of a file.
         source_name: String,
+        /// The index that was asked for, from 0.
         index: usize,
+        /// How many there are.
         len: usize,
     },
     /// An array file that cannot be read.

@@ -7,12 +7,16 @@ use nalgebra::{Matrix3, Vector3};
 /// A similarity transform: `y = scale * rotation * x + translation`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Similarity {
+    /// 1 for a rigid transform; never negative.
     pub scale: f64,
+    /// Proper: its determinant is 1.
     pub rotation: Matrix3<f64>,
+    /// Metres, in the frame of the target.
     pub translation: Vector3<f64>,
 }
 
 impl Similarity {
+    /// The transform that changes nothing.
     #[must_use]
     pub fn identity() -> Self {
         Self {
@@ -22,6 +26,7 @@ impl Similarity {
         }
     }
 
+    /// Where the transform takes a point.
     #[must_use]
     pub fn apply(&self, point: &Vector3<f64>) -> Vector3<f64> {
         self.scale * (self.rotation * point) + self.translation
@@ -51,6 +56,7 @@ pub enum Degeneracy {
 /// The result of [`align`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Alignment {
+    /// From source to target.
     pub transform: Similarity,
     /// `None` when the transform is the unique optimum.
     pub degenerate: Option<Degeneracy>,

@@ -15,6 +15,7 @@ const TOLERANCE: f64 = 1e-9;
 /// A lens on a pixel grid.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Camera {
+    /// How rays become points of the grid; its centre and focal lengths are in pixels of this image.
     pub lens: Lens,
     /// Pixels.
     pub width: u32,
@@ -27,49 +28,73 @@ pub struct Camera {
 /// The projection itself.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Lens {
+    /// Without distortion.
     Pinhole(Pinhole),
+    /// The fisheye of Project Aria and Quest.
     Fisheye624(Fisheye624),
+    /// `OpenCV`'s fisheye model.
     KannalaBrandt(KannalaBrandt),
+    /// `OpenCV`'s rational model, for wide lenses that are close to a pinhole.
     Rational(Rational),
 }
 
 /// `u = fx x/z + cx`, `v = fy y/z + cy`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Pinhole {
+    /// Focal length along x, pixels.
     pub fx: f64,
+    /// Focal length along y, pixels.
     pub fy: f64,
+    /// Column of the principal point, pixels.
     pub cx: f64,
+    /// Row of the principal point, pixels.
     pub cy: f64,
 }
 
 /// Six radial, two tangential and four thin-prism terms around the equidistant projection.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Fisheye624 {
+    /// Focal length along x, pixels (per radian near the axis).
     pub fx: f64,
+    /// Focal length along y, pixels (per radian near the axis).
     pub fy: f64,
+    /// Column of the principal point, pixels.
     pub cx: f64,
+    /// Row of the principal point, pixels.
     pub cy: f64,
+    /// `k0` to `k5`: factors of the angle's powers 3, 5, ..., 13, radians.
     pub radial: [f64; 6],
+    /// `p0` and `p1`.
     pub tangential: [f64; 2],
+    /// `s0` to `s3`: of the squared and the fourth power of the radius, first along x, then along y.
     pub prism: [f64; 4],
 }
 
 /// Four radial terms around the equidistant projection; serves fields of view beyond 180 degrees.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct KannalaBrandt {
+    /// Focal length along x, pixels (per radian near the axis).
     pub fx: f64,
+    /// Focal length along y, pixels (per radian near the axis).
     pub fy: f64,
+    /// Column of the principal point, pixels.
     pub cx: f64,
+    /// Row of the principal point, pixels.
     pub cy: f64,
+    /// `k1` to `k4` of `OpenCV`: factors of the angle's powers 3, 5, 7 and 9, radians.
     pub radial: [f64; 4],
 }
 
 /// `OpenCV`'s eight distortion terms `k1 k2 p1 p2 k3 k4 k5 k6` around a pinhole.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Rational {
+    /// Focal length along x, pixels.
     pub fx: f64,
+    /// Focal length along y, pixels.
     pub fy: f64,
+    /// Column of the principal point, pixels.
     pub cx: f64,
+    /// Row of the principal point, pixels.
     pub cy: f64,
     /// In `OpenCV`'s order.
     pub distortion: [f64; 8],

@@ -93,9 +93,11 @@ pub enum FingerPose<'a> {
 /// A hand at one moment.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ManoPose<'a> {
+    /// Coefficients of the shape (betas); zeros for the mean hand.
     pub shape: [f64; SHAPE],
     /// Axis times angle; turns about the wrist.
     pub orientation: [f64; 3],
+    /// Rotations of the fingers, without the wrist.
     pub fingers: FingerPose<'a>,
     /// Metres.
     pub translation: [f64; 3],

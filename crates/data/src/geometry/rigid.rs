@@ -12,18 +12,24 @@ const ROTATION_TOLERANCE: f64 = 1e-3;
 /// Why sixteen numbers are not a pose.
 #[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
 pub enum PoseError {
+    /// A value is NaN or infinite.
     #[error("the pose has a value that is not finite")]
     NotFinite,
+    /// A rigid transform, written column by column.
     #[error(
         "the fourth row of the pose is not 0 0 0 1, its fourth column is: the matrix is transposed (column-major, as ARKit, ARCore and Unity hold it)"
     )]
     Transposed,
+    /// The fourth row is not `0 0 0 1`, and the matrix is no transposed pose either.
     #[error("the fourth row of the pose is not 0 0 0 1")]
     NotAffine,
+    /// A rotation times this positive factor, which is farther from 1 than rounding explains.
     #[error("the pose's rotation part is scaled by {0:.3}: its columns must be of length one")]
     Scaled(f64),
+    /// Orthogonal, but of determinant -1: the axes are left-handed.
     #[error("the pose's rotation part is mirrored: one of its axes points the other way")]
     Mirrored,
+    /// The columns are not orthogonal, differ in length, or are mirrored and scaled at once.
     #[error("the pose's rotation part is not a rotation")]
     NotARotation,
 }

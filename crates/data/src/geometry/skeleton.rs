@@ -14,7 +14,9 @@ pub type Joints = [[f32; 3]; JOINTS];
 /// A named joint list with its tree and its mirror image.
 #[derive(Debug, Clone, Copy)]
 pub struct Skeleton {
+    /// `hand` or `body`.
     pub name: &'static str,
+    /// What the joints are called, in the order of every array of joints.
     pub joints: [&'static str; JOINTS],
     /// The joint nearer to the root; the root is its own parent.
     pub parents: [usize; JOINTS],

@@ -19,6 +19,7 @@ pub struct SignalCode {
     pub name: &'static str,
     /// One line about what it computes.
     pub about: &'static str,
+    /// The function that makes the values of a clip.
     pub derive: Derive,
 }
 

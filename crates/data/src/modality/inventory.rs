@@ -11,6 +11,7 @@ use std::collections::BTreeMap;
 /// Statistics of many clips.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Inventory {
+    /// Clips that were counted.
     pub clips: u64,
     /// In the order of [`all`].
     pub modalities: Vec<Row>,
@@ -19,6 +20,7 @@ pub struct Inventory {
 /// One modality of an [`Inventory`].
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Row {
+    /// Its registry name.
     pub modality: String,
     /// Samples per second.
     pub rate: f64,
@@ -26,6 +28,7 @@ pub struct Row {
     pub frame: String,
     /// Shapes that were met, as `60x21x3`, and in how many clips.
     pub shapes: BTreeMap<String, u64>,
+    /// Of the clips that it can be taken out of, by channel.
     pub statistics: SignalStatistics,
     /// Clips whose signal the modality cannot represent, by reason.
     pub refused: BTreeMap<String, u64>,

@@ -136,13 +136,26 @@ pub fn all(format: &ClipFormat) -> Vec<Box<dyn Modality>> {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Shape {
     /// Values over time, `[samples, channels]`: camera, gaze and every declared modality.
-    Temporal { samples: usize, channels: usize },
+    Temporal {
+        /// Samples of a clip.
+        samples: usize,
+        /// Values of a sample.
+        channels: usize,
+    },
     /// Joints over time, `[samples, joints, 3]`: body and hands.
-    Kinematic { samples: usize, joints: usize },
+    Kinematic {
+        /// Samples of a clip.
+        samples: usize,
+        /// Joints of a sample.
+        joints: usize,
+    },
     /// Video, `[frames, height, width, 3]`: rgb and depth.
     Video {
+        /// Frames of a clip.
         frames: usize,
+        /// Pixels.
         height: usize,
+        /// Pixels.
         width: usize,
     },
 }
@@ -228,17 +241,26 @@ fn expect_shape(
 /// Why a clip and a modality do not fit.
 #[derive(Debug, thiserror::Error)]
 pub enum ModalityError {
+    /// The values or their validity have another shape than the modality at the sizes of its format.
     #[error("clip `{clip}`: {modality} has shape {found:?}, expected {expected:?}")]
     Shape {
+        /// The id of the clip.
         clip: String,
+        /// The registry name of the modality.
         modality: String,
+        /// The shape that was met.
         found: Vec<usize>,
+        /// The shape that the format asks for.
         expected: Vec<usize>,
     },
+    /// An invalid first pose, a value where none may be missing, or code that is not linked in.
     #[error("clip `{clip}`: {modality}: {reason}")]
     Degenerate {
+        /// The id of the clip.
         clip: String,
+        /// The registry name of the modality.
         modality: String,
+        /// What is wrong with the values.
         reason: String,
     },
 }

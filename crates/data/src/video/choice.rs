@@ -4,9 +4,17 @@
 #[derive(Debug, Clone, PartialEq)]
 pub enum FrameTimes {
     /// Frame `k` at `k / fps`.
-    Constant { fps: f64, frames: usize },
+    Constant {
+        /// Frames per second.
+        fps: f64,
+        /// How many there are.
+        frames: usize,
+    },
     /// Seconds of every frame from the first one, ascending.
-    Variable { seconds: Vec<f64> },
+    Variable {
+        /// When each frame is shown; the first one is at 0.
+        seconds: Vec<f64>,
+    },
 }
 
 /// A frame may stand this far from its place on an even grid before the video counts as one of variable rate.
@@ -41,6 +49,7 @@ impl FrameTimes {
         }
     }
 
+    /// How many frames are shown.
     pub fn frames(&self) -> usize {
         match self {
             FrameTimes::Constant { frames, .. } => *frames,

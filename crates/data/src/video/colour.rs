@@ -11,6 +11,7 @@ use rusty_h264_common::YuvFrame;
 /// How colours are coded.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct ColourSpace {
+    /// How luma and chroma are made of red, green and blue.
     pub matrix: Matrix,
     /// Luma from 0 to 255 instead of 16 to 235.
     pub full_range: bool,
@@ -19,14 +20,18 @@ pub struct ColourSpace {
 /// Matrix coefficients (ITU-T H.273, table 4).
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Matrix {
+    /// Not said, or said with a code that is not known: treated as BT.601.
     #[default]
     Unspecified,
+    /// ITU-R BT.601, of standard definition.
     Bt601,
+    /// ITU-R BT.709, of high definition.
     Bt709,
     /// Title 47 of the FCC's code.
     Fcc,
     /// SMPTE ST 240.
     Smpte240,
+    /// ITU-R BT.2020, of ultra-high definition; constant luminance is not told apart.
     Bt2020,
 }
 

@@ -240,10 +240,12 @@ impl std::fmt::Debug for Pictures {
 pub enum PictureError {
     /// A coding tool that the embedded decoder does not have.
     Unsupported(String),
+    /// It does not follow the format, is cut off, or the decoder failed on it: what is wrong, in words.
     Damaged(String),
 }
 
 impl Pictures {
+    /// A decoder that has seen nothing; samples name their configuration by its index here.
     #[must_use]
     pub fn new(configurations: Arc<Vec<Configuration>>) -> Self {
         Pictures {

@@ -16,7 +16,9 @@ const BLOCK: usize = 32;
 /// Eight-bit RGB, row by row.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Image {
+    /// Pixels.
     pub width: u32,
+    /// Pixels.
     pub height: u32,
     /// `height * width * 3` bytes.
     pub data: Vec<u8>,
@@ -25,10 +27,14 @@ pub struct Image {
 /// Quarter turns clockwise.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Turn {
+    /// As it is.
     #[default]
     None,
+    /// By 90 degrees to the right.
     Clockwise,
+    /// By 180 degrees.
     Half,
+    /// By 90 degrees to the left.
     CounterClockwise,
 }
 
@@ -89,7 +95,9 @@ impl Turn {
 /// How a stored picture comes upright: mirrored left to right first, then turned.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Orientation {
+    /// Whether left and right are exchanged, before the turn.
     pub mirrored: bool,
+    /// How it is turned after that.
     pub turn: Turn,
 }
 
@@ -280,9 +288,13 @@ pub fn squared(width: u32, height: u32, aspect: f64) -> (u32, u32) {
 /// How a picture becomes a square of `side` pixels: what happens to pixels, for intrinsics and gaze.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SquareFit {
+    /// Width and height of the whole picture once its short side is `side`, pixels.
     pub resized: (u32, u32),
+    /// Columns of the resized picture to the left of the square.
     pub left: u32,
+    /// Rows of the resized picture above the square.
     pub top: u32,
+    /// Width and height of the square, pixels.
     pub side: u32,
 }
 

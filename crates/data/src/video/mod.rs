@@ -105,6 +105,7 @@ impl DecoderChoice {
 pub struct VideoInfo {
     /// Square pixels of the upright picture, rotation applied.
     pub width: u32,
+    /// Square pixels of the upright picture, as the width.
     pub height: u32,
     /// Frames per second; the mean where the rate varies.
     pub fps: f64,
@@ -174,6 +175,7 @@ pub struct Frame {
     pub index: usize,
     /// From the first frame of the video.
     pub seconds: f64,
+    /// Upright, with square pixels.
     pub image: Image,
 }
 
@@ -326,11 +328,13 @@ impl Video {
         })
     }
 
+    /// The file or the folder of pictures that was opened.
     #[must_use]
     pub fn path(&self) -> &Path {
         &self.path
     }
 
+    /// Its size, rate, length and decoder.
     #[must_use]
     pub fn info(&self) -> &VideoInfo {
         &self.info

@@ -32,6 +32,7 @@ const DEEPEST: usize = 12;
 /// The video track of a file: the first one that is switched on, pictures of chapters and covers aside.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Track {
+    /// Its number in the file (`track_ID`), by which fragments and `ffmpeg` know it.
     pub id: u32,
     /// Players show it.
     pub enabled: bool,

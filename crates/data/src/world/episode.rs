@@ -35,6 +35,7 @@ pub struct Episode {
 
 /// Everything exact at one time.
 pub struct Moment {
+    /// The wearer's joints and frames in the world.
     pub posture: Posture,
     /// Left and right, world coordinates.
     pub hands: [[Point3<f64>; JOINTS]; 2],

@@ -22,6 +22,7 @@ pub struct Fingers {
 }
 
 impl Fingers {
+    /// Hanging beside the body: every finger slightly bent.
     pub const RELAXED: Self = Self {
         knuckle: [0.30, 0.35, 0.40, 0.45],
         middle: [0.40, 0.45, 0.50, 0.50],
@@ -29,6 +30,7 @@ impl Fingers {
         opposition: 0.35,
         thumb: 0.25,
     };
+    /// Flat, with the fingers spread.
     pub const OPEN: Self = Self {
         knuckle: [0.02; 4],
         middle: [0.06; 4],
@@ -36,6 +38,7 @@ impl Fingers {
         opposition: 0.15,
         thumb: 0.0,
     };
+    /// Closed, with the thumb before the fingers.
     pub const FIST: Self = Self {
         knuckle: [1.35; 4],
         middle: [1.60; 4],
@@ -43,6 +46,7 @@ impl Fingers {
         opposition: 0.75,
         thumb: 0.85,
     };
+    /// The index finger straight, the others closed.
     pub const POINT: Self = Self {
         knuckle: [0.05, 1.25, 1.35, 1.35],
         middle: [0.05, 1.50, 1.55, 1.55],

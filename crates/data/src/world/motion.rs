@@ -17,7 +17,9 @@ const EYE_LIMIT: f64 = 0.58;
 /// Everything about the wearer's motion that was decided, as functions of time.
 #[derive(Debug, Clone)]
 pub struct Motion {
+    /// The wearer's measures.
     pub wearer: Wearer,
+    /// What the wearer does, and when.
     pub plan: Plan,
     path: Path,
     steps: Steps,
@@ -36,9 +38,11 @@ pub struct Motion {
 /// The wearer at one moment.
 #[derive(Debug, Clone)]
 pub struct Posture {
+    /// Every joint of the body in the world.
     pub body: BodyPose,
     /// Frames at the wrists: see [`hand`].
     pub T_world_hand: [Isometry3<f64>; 2],
+    /// The head camera in the world: `OpenCV` axes, metres.
     pub T_world_camera: Isometry3<f64>,
 }
 

@@ -11,24 +11,33 @@ use nalgebra::{Isometry3, Vector3};
 /// What a pixel belongs to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Part {
+    /// The room and everything in it that does not move.
     Room,
+    /// Something that can be picked up, held or not.
     Object,
+    /// The left arm, from shoulder to finger tips.
     LeftArm,
+    /// The right arm, from shoulder to finger tips.
     RightArm,
+    /// The rest of the wearer.
     Body,
 }
 
 /// A moving primitive.
 #[derive(Debug, Clone, Copy)]
 pub struct Moving {
+    /// Its shape, material and place in the world.
     pub primitive: Primitive,
+    /// What its pixels belong to.
     pub part: Part,
 }
 
 /// One rendered image.
 #[derive(Debug, Clone)]
 pub struct Frame {
+    /// Pixels.
     pub width: usize,
+    /// Pixels.
     pub height: usize,
     /// `[H, W, 3]`, sRGB.
     pub rgb: Vec<u8>,

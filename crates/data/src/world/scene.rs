@@ -12,9 +12,13 @@ pub struct Scene {
     pub size: V3,
     /// Floor, ceiling, then the walls at y = 0, x = width, y = depth, x = 0.
     pub walls: [Material; 6],
+    /// What primitives look like; they name one by its index here.
     pub materials: Vec<Material>,
+    /// Everything that does not move, the walls aside; metres, in the room's axes.
     pub primitives: Vec<Primitive>,
+    /// What can be picked up; plans and spots name one by its index here.
     pub objects: Vec<Object>,
+    /// Where a person can stand; at least one in a room that was built.
     pub spots: Vec<Spot>,
     /// Things worth a look: pictures, plants, lamps, windows.
     pub landmarks: Vec<Point3<f64>>,
@@ -22,20 +26,25 @@ pub struct Scene {
     pub obstacles: Vec<Rect>,
     /// The ceiling lamp.
     pub lamp: V3,
+    /// Linear light of the lamp by channel, about 1.
     pub lamp_colour: V3,
+    /// Linear light that comes from everywhere, by channel; less at night.
     pub ambient: V3,
 }
 
 /// An upright rectangle on the floor, metres.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Rect {
+    /// The corner with the smallest x and y.
     pub low: Point2<f64>,
+    /// The corner with the largest x and y.
     pub high: Point2<f64>,
 }
 
 /// A place from which objects are in reach.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Spot {
+    /// Where the person stands on the floor, metres.
     pub stand: Point2<f64>,
     /// Radians; 0 looks along x.
     pub heading: f64,

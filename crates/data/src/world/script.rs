@@ -23,14 +23,20 @@ pub enum Reach {
     Rest,
     /// A point of the world.
     World {
+        /// Where the wrist goes, metres.
         wrist: Point3<f64>,
+        /// Where the palm faces.
         palm: Vector3<f64>,
+        /// Where the fingers point.
         fingers: Vector3<f64>,
     },
     /// Before the chest: an offset and directions in the heading's axes (x forward, y left, z up).
     Chest {
+        /// From the chest joint to the wrist, metres at a stature of 1.75 m.
         offset: Vector3<f64>,
+        /// Where the palm faces.
         palm: Vector3<f64>,
+        /// Where the fingers point.
         fingers: Vector3<f64>,
     },
 }
@@ -38,8 +44,11 @@ pub enum Reach {
 /// What the eyes are on.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Look {
+    /// A point of the world, metres.
     Point(Point3<f64>),
+    /// An object of the scene by its index, wherever it is.
     Object(usize),
+    /// The wearer's own hand, and what may be in it.
     Hand(Side),
     /// Where one is going: radians left of and below the heading.
     Ahead(f64, f64),
@@ -48,35 +57,51 @@ pub enum Look {
 /// A fixation begins.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Fixation {
+    /// Seconds, below 0 for the first one; it lasts until the next begins.
     pub start: f64,
+    /// What the eyes are on from then.
     pub look: Look,
 }
 
 /// An object is in a hand.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Hold {
+    /// The hand that has it.
     pub side: Side,
+    /// Index of the object in the scene.
     pub object: usize,
+    /// Seconds.
     pub start: f64,
+    /// Seconds; infinite where the object is not put back.
     pub end: f64,
 }
 
 /// Everything that is going to happen.
 #[derive(Debug, Clone)]
 pub struct Plan {
+    /// How long the plan is at least.
     pub seconds: f64,
+    /// Where the wearer stands at first, metres on the floor.
     pub start: Point2<f64>,
+    /// Where the wearer faces at first: radians from x, positive to the left.
     pub start_heading: f64,
     /// Straight walks; constant speed between the times, smoothed later.
     pub walks: Vec<Key<Point2<f64>>>,
+    /// Turns of the body: radians from x, positive to the left, not wrapped.
     pub headings: Vec<Key<f64>>,
+    /// Forward bends of the chest, radians.
     pub lean: Vec<Key<f64>>,
+    /// How far the pelvis is lowered, metres at a stature of 1.75 m.
     pub crouch: Vec<Key<f64>>,
+    /// Where the left and the right wrist go; each rests at first.
     pub reaches: [Vec<Key<Reach>>; 2],
+    /// How the left and the right fingers are bent; they are relaxed at first.
     pub fingers: [Vec<Key<Fingers>>; 2],
+    /// Where the eyes go, in the order of time.
     pub gaze: Vec<Fixation>,
     /// Start and end of blinks.
     pub blinks: Vec<(f64, f64)>,
+    /// Which hand has which object, in the order they were planned.
     pub holds: Vec<Hold>,
 }
 

@@ -8,8 +8,11 @@ use nalgebra::{Point2, Point3};
 /// The path of the wearer over the floor.
 #[derive(Debug, Clone)]
 pub struct Path {
+    /// Place along the room's x over time, metres.
     pub x: Curve,
+    /// Place along the room's y over time, metres.
     pub y: Curve,
+    /// Where the body faces over time: radians from x, positive to the left, not wrapped.
     pub heading: Curve,
 }
 
@@ -40,7 +43,9 @@ pub struct Steps {
 /// A foot at one moment.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Foot {
+    /// The toe joint in the world, metres.
     pub toe: Point3<f64>,
+    /// Where the foot points: radians from x, positive to the left.
     pub yaw: f64,
     /// How far through its swing, `None` when it stands.
     pub swing: Option<f64>,

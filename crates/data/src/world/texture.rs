@@ -8,6 +8,7 @@ use super::vector::{V3, v3};
 /// What a surface looks like.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Material {
+    /// How the colours are laid out.
     pub pattern: Pattern,
     /// Linear light, 0 to 1.
     pub colours: [V3; 3],
@@ -24,18 +25,31 @@ pub struct Material {
 /// How the colours are laid out.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Pattern {
+    /// The first colour everywhere.
     Plain,
+    /// Boards with grain between the first two colours; seams in the third.
     Planks,
+    /// Squares in the first two colours by turns; joints in the third.
     Tiles,
+    /// Rows of bricks between the first two colours; mortar in the third.
     Bricks,
+    /// Soft patches between the first two colours, and a fine pile.
     Carpet,
+    /// Stripes of the first two colours with flowers in the third.
     Wallpaper,
+    /// Bands of all three colours.
     Stripes,
+    /// Dots of the second colour on the first.
     Dots,
+    /// Squares of the first two colours by turns, without joints.
     Checker,
+    /// Rings and grain between the first two colours.
     Wood,
+    /// Folds between the first two colours, and a fine weave.
     Fabric,
+    /// Diamonds of the first two colours within two bands along the outline.
     Rug,
+    /// An abstract painting on the first colour.
     Picture,
     /// Sky and hills behind glass.
     Outdoors,

@@ -37,8 +37,11 @@ impl Mix for Vector3<f64> {
 /// A value to be reached between two times.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Key<T> {
+    /// Seconds: the value before holds until then.
     pub start: f64,
+    /// Seconds: from then on the value holds.
     pub end: f64,
+    /// The value that is reached.
     pub value: T,
 }
 

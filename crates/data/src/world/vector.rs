@@ -6,8 +6,11 @@ use std::ops::{Add, AddAssign, Mul, Neg, Sub};
 /// A point, direction or colour.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct V3 {
+    /// Along x, or red.
     pub x: f32,
+    /// Along y, or green.
     pub y: f32,
+    /// Along z, or blue.
     pub z: f32,
 }
 
@@ -17,18 +20,25 @@ pub const fn v3(x: f32, y: f32, z: f32) -> V3 {
 }
 
 impl V3 {
+    /// The origin, or black.
     pub const ZERO: Self = v3(0.0, 0.0, 0.0);
+    /// Of unit length along x.
     pub const X: Self = v3(1.0, 0.0, 0.0);
+    /// Of unit length along y.
     pub const Y: Self = v3(0.0, 1.0, 0.0);
+    /// Of unit length along z.
     pub const Z: Self = v3(0.0, 0.0, 1.0);
 
+    /// Three equal components.
     pub const fn splat(v: f32) -> Self {
         v3(v, v, v)
     }
+    /// The dot product.
     #[inline]
     pub fn dot(self, o: Self) -> f32 {
         self.x * o.x + self.y * o.y + self.z * o.z
     }
+    /// The cross product, by the right-hand rule.
     #[inline]
     #[must_use]
     pub fn cross(self, o: Self) -> Self {
@@ -38,25 +48,30 @@ impl V3 {
             self.x * o.y - self.y * o.x,
         )
     }
+    /// The Euclidean length.
     #[inline]
     pub fn norm(self) -> f32 {
         self.dot(self).sqrt()
     }
+    /// The same direction at unit length; zero stays zero.
     #[inline]
     #[must_use]
     pub fn normalized(self) -> Self {
         self * (1.0 / self.norm().max(1e-12))
     }
+    /// From `self` at 0 to `o` at 1, linearly; `t` may lie outside.
     #[inline]
     #[must_use]
     pub fn lerp(self, o: Self, t: f32) -> Self {
         self + (o - self) * t
     }
+    /// Component by component, as light times albedo.
     #[inline]
     #[must_use]
     pub fn scaled(self, o: Self) -> Self {
         v3(self.x * o.x, self.y * o.y, self.z * o.z)
     }
+    /// The magnitude of each component.
     #[inline]
     #[must_use]
     pub fn abs(self) -> Self {

@@ -10,7 +10,9 @@ use rand::RngExt;
 
 /// Left is 0, right is 1, everywhere in the world.
 pub type Side = usize;
+/// The index of the left side.
 pub const LEFT: Side = 0;
+/// The index of the right side.
 pub const RIGHT: Side = 1;
 
 /// +1 on the left, -1 on the right: the sign of y in body axes.
@@ -21,9 +23,13 @@ pub const fn sign(side: Side) -> f64 {
 /// Lengths of one person, metres.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Wearer {
+    /// From the floor to the top of the head, standing.
     pub stature: f64,
+    /// Hip in the pelvis frame, left side.
     pub hip: Vector3<f64>,
+    /// Hip to knee.
     pub thigh: f64,
+    /// Knee to ankle.
     pub shin: f64,
     /// Ankle in the frame of the foot, which has its origin at the toe joint.
     pub ankle: Vector3<f64>,
@@ -35,7 +41,9 @@ pub struct Wearer {
     pub collar: Vector3<f64>,
     /// Shoulder in the chest frame at the collar, left side.
     pub shoulder: Vector3<f64>,
+    /// Shoulder to elbow.
     pub upper_arm: f64,
+    /// Elbow to wrist.
     pub forearm: f64,
     /// Size of the hand relative to a hand of 0.19 m.
     pub hand_scale: f64,
@@ -108,7 +116,9 @@ pub fn yaw_pitch(yaw: f64, pitch: f64) -> Rotation3<f64> {
 /// What drives the trunk.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TrunkPose {
+    /// The pelvis joint in the world, metres.
     pub pelvis: Point3<f64>,
+    /// Where the body faces: radians from x, positive to the left.
     pub heading: f64,
     /// Forward bend of the chest, radians.
     pub lean: f64,
@@ -121,14 +131,23 @@ pub struct TrunkPose {
 /// The trunk's joints and frames.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Trunk {
+    /// At the pelvis joint, body axes.
     pub T_world_pelvis: Isometry3<f64>,
+    /// At spine3, body axes.
     pub T_world_chest: Isometry3<f64>,
+    /// At the head joint, body axes: x where the face points.
     pub T_world_head: Isometry3<f64>,
+    /// In the world, metres.
     pub spine1: Point3<f64>,
+    /// In the world, metres.
     pub spine2: Point3<f64>,
+    /// In the world, metres.
     pub neck: Point3<f64>,
+    /// Left and right, in the world, metres.
     pub hips: [Point3<f64>; 2],
+    /// Left and right, in the world, metres.
     pub collars: [Point3<f64>; 2],
+    /// Left and right, in the world, metres.
     pub shoulders: [Point3<f64>; 2],
 }
 
@@ -196,11 +215,17 @@ pub fn two_bones(
 /// A whole pose in the world.
 #[derive(Debug, Clone, PartialEq)]
 pub struct BodyPose {
+    /// Pelvis, spine, head, hips and shoulders.
     pub trunk: Trunk,
+    /// Left and right, metres.
     pub knees: [Point3<f64>; 2],
+    /// Left and right, metres.
     pub ankles: [Point3<f64>; 2],
+    /// The toe joints, left and right, metres.
     pub toes: [Point3<f64>; 2],
+    /// Left and right, metres.
     pub elbows: [Point3<f64>; 2],
+    /// Left and right, metres; short of their targets where these are out of reach.
     pub wrists: [Point3<f64>; 2],
 }
 

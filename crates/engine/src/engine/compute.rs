@@ -186,6 +186,7 @@ impl JsonSchema for DeviceChoice {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Precision {
+    /// Single precision, 32 bits.
     #[default]
     F32,
     /// bfloat16: not available, no operation computes in it yet.

@@ -76,6 +76,7 @@ impl<'a> Initialise<'a> {
         self.at(&index.to_string())
     }
 
+    /// The device that the parameters are made on.
     #[must_use]
     pub fn compute(&self) -> &'a Compute {
         self.compute

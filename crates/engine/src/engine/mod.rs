@@ -36,41 +36,84 @@ pub use weights::{HostTensor, Values, Weights};
 /// Why the engine refuses.
 #[derive(Debug, thiserror::Error)]
 pub enum EngineError {
+    /// The device asked for is none of this machine, or this program was built without its kind.
     #[error("there is no device `{device}`: {hint}")]
-    NoSuchDevice { device: String, hint: &'static str },
+    NoSuchDevice {
+        /// Kind and number: `cuda:0`, `vulkan:1`.
+        device: String,
+        /// What is lacking, and what works or helps instead.
+        hint: &'static str,
+    },
+    /// A precision is asked for in which no operation computes.
     #[error(
         "precision `{precision}` is not available on `{device}`: no operation computes in it yet; use `f32`"
     )]
     Precision {
+        /// As it is written in settings.
         precision: &'static str,
+        /// The device asked for: `cpu`, `cuda:0`, `vulkan:1`.
         device: String,
     },
+    /// Weights are loaded that lack a tensor of the model.
     #[error("the weights have no tensor `{name}` of shape {expected:?}")]
-    Missing { name: String, expected: Vec<usize> },
-    #[error("tensor `{name}` has shape {found:?}, the model expects {expected:?}")]
-    Shape {
+    Missing {
+        /// The model's name for it.
         name: String,
-        found: Vec<usize>,
+        /// The shape it should have.
         expected: Vec<usize>,
     },
+    /// Weights are loaded that have a tensor of the model in another shape.
+    #[error("tensor `{name}` has shape {found:?}, the model expects {expected:?}")]
+    Shape {
+        /// The tensor.
+        name: String,
+        /// Its shape in the weights.
+        found: Vec<usize>,
+        /// Its shape in the model.
+        expected: Vec<usize>,
+    },
+    /// A tensor's elements are of another type than is asked for.
     #[error("tensor `{name}` holds {found}, the model expects {expected}")]
     Kind {
+        /// The tensor.
         name: String,
+        /// What the weights have: `f32`, `f64`, `i64` or `u8`.
         found: &'static str,
+        /// What is asked for, by the same names.
         expected: &'static str,
     },
+    /// Weights are loaded that have tensors beside those of the model: they belong to another one.
     #[error("the weights hold {count} tensors the model does not know, first `{first}`")]
-    Unknown { count: usize, first: String },
+    Unknown {
+        /// How many names the model does not have.
+        count: usize,
+        /// The first of them in alphabetical order.
+        first: String,
+    },
+    /// Weights are loaded that have a NaN or an infinite value.
     #[error("tensor `{name}` holds a value that is not finite")]
-    NotFinite { name: String },
+    NotFinite {
+        /// The tensor.
+        name: String,
+    },
+    /// A file of weights cannot be opened or read, or is not complete and well-formed.
     #[error("{path}: {reason}")]
-    File { path: String, reason: String },
+    File {
+        /// The file.
+        path: String,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// A file of weights cannot be written; what stood under its name before is still there.
     #[error("{path}: {error}")]
     Write {
+        /// The file.
         path: String,
+        /// What the operating system says.
         #[source]
         error: std::io::Error,
     },
+    /// A segment lies outside the rows, or query rows overlap or do not ascend: which ones, in words.
     #[error("segments: {0}")]
     Segments(String),
 }

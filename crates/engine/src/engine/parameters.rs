@@ -54,11 +54,13 @@ impl Parameter {
         }
     }
 
+    /// The length of each axis: `[out, in]` for the weight of a linear layer.
     #[must_use]
     pub fn shape(&self) -> &[usize] {
         &self.shape
     }
 
+    /// Whether an optimizer touches it.
     #[must_use]
     pub fn kind(&self) -> Kind {
         self.kind
@@ -70,6 +72,7 @@ impl Parameter {
         self.shape.iter().product()
     }
 
+    /// Whether it holds no number: an axis of length 0.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.len() == 0

@@ -8,6 +8,7 @@ use super::EngineError;
 /// One group of query rows and the key rows that all of them see.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Segment {
+    /// Rows of the query tokens.
     pub queries: Range<usize>,
     /// May be empty: attention then gives zeros.
     pub keys: Range<usize>,
@@ -106,6 +107,7 @@ impl Segments {
         }
     }
 
+    /// In the order of their query rows.
     #[must_use]
     pub fn list(&self) -> &[Segment] {
         &self.list

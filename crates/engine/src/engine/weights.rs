@@ -18,13 +18,18 @@ const MAX_HEADER: u64 = 100_000_000;
 /// The values of one array. Half-precision floats widen to `F32` on reading, small integers to `I64`.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Values {
+    /// Single precision; on reading also what was half precision or bfloat16.
     F32(Vec<f32>),
+    /// Double precision.
     F64(Vec<f64>),
+    /// Signed, 64 bits; on reading also narrower integers of more than a byte, and signed bytes.
     I64(Vec<i64>),
+    /// Unsigned bytes.
     U8(Vec<u8>),
 }
 
 impl Values {
+    /// How many values there are.
     #[must_use]
     pub fn len(&self) -> usize {
         match self {
@@ -35,6 +40,7 @@ impl Values {
         }
     }
 
+    /// Whether there is no value.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.len() == 0
@@ -55,7 +61,9 @@ impl Values {
 /// An array on the host, row-major.
 #[derive(Debug, Clone, PartialEq)]
 pub struct HostTensor {
+    /// The length of each axis, the slowest first; none for a single number.
     pub shape: Vec<usize>,
+    /// As many values as the product of the shape.
     pub values: Values,
 }
 
@@ -105,7 +113,9 @@ fn kind(name: &str, found: &Values, expected: &'static str) -> EngineError {
 /// Arrays by name, with the file's text metadata.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Weights {
+    /// By name: field paths joined by dots, `encoder.blocks.0.attn.qkv.weight`.
     pub tensors: BTreeMap<String, HostTensor>,
+    /// Texts by key, from the header's `__metadata__`.
     pub metadata: BTreeMap<String, String>,
 }
 

@@ -10,12 +10,14 @@ use crate::engine::{Initialise, Segments, ops, parameters};
 pub struct SelfAttention {
     /// `[3 D, D]`, rows `[3][heads][D / heads]`.
     pub qkv: Linear,
+    /// `[D, D]`, on the heads' outputs side by side.
     pub proj: Linear,
     heads: usize,
 }
 parameters!(SelfAttention { qkv, proj });
 
 impl SelfAttention {
+    /// Tokens of `width` values; `heads` must divide it. `bias` is for both layers.
     #[must_use]
     pub fn new(init: &Initialise<'_>, width: usize, heads: usize, bias: bool) -> Self {
         Self {
@@ -36,15 +38,18 @@ impl SelfAttention {
 /// Query tokens attend to the context tokens of their own segment.
 #[derive(Debug, Clone)]
 pub struct CrossAttention {
+    /// `[D, D]`, rows `[heads][D / heads]`.
     pub q: Linear,
     /// `[2 D, D]`, rows `[2][heads][D / heads]`.
     pub kv: Linear,
+    /// `[D, D]`, on the heads' outputs side by side.
     pub proj: Linear,
     heads: usize,
 }
 parameters!(CrossAttention { q, kv, proj });
 
 impl CrossAttention {
+    /// Query and context tokens of `width` values; `heads` must divide it. `bias` is for all three layers.
     #[must_use]
     pub fn new(init: &Initialise<'_>, width: usize, heads: usize, bias: bool) -> Self {
         Self {

@@ -53,7 +53,9 @@ impl Linear {
 /// Layer norm with a weight and, in the tokenizers, a bias.
 #[derive(Debug, Clone)]
 pub struct LayerNorm {
+    /// `[D]`.
     pub weight: Parameter,
+    /// `[D]`; `None` in layers without a bias.
     pub bias: Option<Parameter>,
 }
 parameters!(LayerNorm { weight, bias });
@@ -83,12 +85,15 @@ impl LayerNorm {
 /// `fc2(gelu(fc1 x))`, or with tanh instead of GELU.
 #[derive(Debug, Clone)]
 pub struct Mlp {
+    /// `[hidden, D]`.
     pub fc1: Linear,
+    /// `[D, hidden]`.
     pub fc2: Linear,
 }
 parameters!(Mlp { fc1, fc2 });
 
 impl Mlp {
+    /// From `width` to `hidden` values and back; `bias` is for both layers.
     #[must_use]
     pub fn new(init: &Initialise<'_>, width: usize, hidden: usize, bias: bool) -> Self {
         Self {
@@ -113,13 +118,17 @@ impl Mlp {
 /// `fc2(silu(fc1 x) * fc3 x)`, without biases.
 #[derive(Debug, Clone)]
 pub struct SwiGlu {
+    /// The gate, `[hidden, D]`.
     pub fc1: Linear,
+    /// What is gated, `[hidden, D]`.
     pub fc3: Linear,
+    /// Back to the tokens, `[D, hidden]`.
     pub fc2: Linear,
 }
 parameters!(SwiGlu { fc1, fc3, fc2 });
 
 impl SwiGlu {
+    /// From `width` to `hidden` values, gated, and back.
     #[must_use]
     pub fn new(init: &Initialise<'_>, width: usize, hidden: usize) -> Self {
         Self {
@@ -129,6 +138,7 @@ impl SwiGlu {
         }
     }
 
+    /// `[N, D]` to `[N, D]`.
     #[must_use]
     pub fn forward(&self, x: Tensor<2>) -> Tensor<2> {
         let gate = self.fc1.forward(x.clone());

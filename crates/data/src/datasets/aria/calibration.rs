@@ -13,6 +13,7 @@ use std::path::Path;
 pub struct DeviceCamera {
     /// On the grid of the stored image.
     pub camera: Camera,
+    /// From the camera's `OpenCV` axes (of the stored, unturned image) to the device's, metres.
     pub T_device_camera: Isometry3<f64>,
 }
 

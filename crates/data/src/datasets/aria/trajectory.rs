@@ -19,6 +19,7 @@ const HOLD: i64 = SECOND / 50;
 pub struct Trajectory {
     /// `T_world_device` over device time.
     pub poses: Track<Isometry3<f64>>,
+    /// Against gravity in the world of the poses, unit length; `None` where the file has no gravity.
     pub up_world: Option<Unit<Vector3<f64>>>,
     /// Time and position of the first rows as written, to match clocks with.
     pub first_rows: Vec<(i64, Vector3<f64>)>,

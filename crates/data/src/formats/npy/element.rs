@@ -5,34 +5,58 @@ use half::f16;
 /// The element type of an array.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Dtype {
+    /// `b1`: a byte that is 0 or 1.
     Bool,
+    /// `i1`: signed, 8 bits.
     I8,
+    /// `i2`: signed, 16 bits.
     I16,
+    /// `i4`: signed, 32 bits.
     I32,
+    /// `i8`: signed, 64 bits.
     I64,
+    /// `u1`: unsigned, 8 bits.
     U8,
+    /// `u2`: unsigned, 16 bits.
     U16,
+    /// `u4`: unsigned, 32 bits.
     U32,
+    /// `u8`: unsigned, 64 bits.
     U64,
+    /// `f2`: half precision.
     F16,
+    /// `f4`: single precision.
     F32,
+    /// `f8`: double precision.
     F64,
 }
 
 /// The elements of an [`super::NpyArray`].
 #[derive(Debug, Clone, PartialEq)]
 pub enum NpyData {
+    /// Of [`Dtype::Bool`].
     Bool(Vec<bool>),
+    /// Of [`Dtype::I8`].
     I8(Vec<i8>),
+    /// Of [`Dtype::I16`].
     I16(Vec<i16>),
+    /// Of [`Dtype::I32`].
     I32(Vec<i32>),
+    /// Of [`Dtype::I64`].
     I64(Vec<i64>),
+    /// Of [`Dtype::U8`].
     U8(Vec<u8>),
+    /// Of [`Dtype::U16`].
     U16(Vec<u16>),
+    /// Of [`Dtype::U32`].
     U32(Vec<u32>),
+    /// Of [`Dtype::U64`].
     U64(Vec<u64>),
+    /// Of [`Dtype::F16`].
     F16(Vec<f16>),
+    /// Of [`Dtype::F32`].
     F32(Vec<f32>),
+    /// Of [`Dtype::F64`].
     F64(Vec<f64>),
 }
 
@@ -58,6 +82,7 @@ macro_rules! with_data {
 pub(super) use with_data;
 
 impl NpyData {
+    /// The type of the elements.
     pub fn dtype(&self) -> Dtype {
         fn of<T: Element>(_: &[T]) -> Dtype {
             T::DTYPE
@@ -124,7 +149,9 @@ impl Dtype {
 /// A number on its way between element types, without loss.
 #[derive(Debug, Clone, Copy)]
 pub enum Number {
+    /// From an integer type, or a bool as 0 or 1.
     Integer(i128),
+    /// From a float type of any width.
     Float(f64),
 }
 
@@ -134,6 +161,7 @@ mod sealed {
 
 /// An element type that npy files can hold. Sealed: the list is [`Dtype`]'s.
 pub trait Element: Copy + sealed::Sealed + 'static {
+    /// The variant of [`Dtype`] that names this type.
     const DTYPE: Dtype;
     #[doc(hidden)]
     fn to_number(self) -> Number;

@@ -22,7 +22,9 @@ use values::{c_order, decode};
 /// An array as it lies in the file, in C order.
 #[derive(Debug, Clone, PartialEq)]
 pub struct NpyArray {
+    /// The length of each axis, the slowest first; none for a single number.
     pub shape: Vec<usize>,
+    /// As many elements as the product of the shape, the last axis fastest.
     pub data: NpyData,
 }
 
@@ -141,6 +143,7 @@ impl NpyArray {
         self.len() == 0
     }
 
+    /// The type of the elements.
     pub fn dtype(&self) -> Dtype {
         self.data.dtype()
     }

@@ -31,7 +31,9 @@ use std::sync::Arc;
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("pickle: byte {offset}: {reason}")]
 pub struct PickleError {
+    /// Bytes from the start of the pickle.
     pub offset: usize,
+    /// What is refused there.
     pub reason: String,
 }
 
@@ -51,15 +53,23 @@ pub struct Id(u32);
 /// What a pickle can build here.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Node {
+    /// Python's `None`.
     None,
+    /// Python's `True` or `False`.
     Bool(bool),
+    /// An integer; one that does not fit is refused.
     Int(i128),
+    /// A float.
     Float(f64),
+    /// A string.
     Text(String),
+    /// A byte string that is held in memory.
     Bytes(Vec<u8>),
     /// Bytes that are elsewhere: in the file.
     Stored(StoredBytes),
+    /// A tuple, or an empty container that was called by its name.
     Tuple(Vec<Id>),
+    /// A list.
     List(Vec<Id>),
     /// Keys in the order of insertion; `OrderedDict` too.
     Dict(Vec<(Id, Id)>),
@@ -67,11 +77,14 @@ pub enum Node {
     Global(Global),
     /// An instance of `argparse.Namespace` or of a TorchScript class, with the dictionary it was given.
     Object {
+        /// Module and name: `argparse.Namespace`, `__torch__.module.Class`.
         class: Arc<str>,
+        /// The dictionary; `None` for an instance that was given none.
         state: Option<Id>,
     },
     /// A piece of memory in the archive.
     Storage(Storage),
+    /// A torch tensor over a storage.
     Tensor(TensorView),
     /// A NumPy type such as `f8`.
     Dtype(String),
@@ -79,6 +92,7 @@ pub enum Node {
     Set(Vec<Id>),
     /// Real and imaginary part.
     Complex(f64, f64),
+    /// A NumPy array; of one whose elements are objects, a list of them.
     Array(ArrayView),
     /// A tensor without strided values: what it is, in words.
     Opaque(&'static str),
@@ -88,9 +102,19 @@ pub enum Node {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum StoredBytes {
     /// In the pickle's file.
-    File { offset: u64, length: u64 },
+    File {
+        /// From the start of the file, what stands before the pickle included.
+        offset: u64,
+        /// How many bytes.
+        length: u64,
+    },
     /// In an object of bytes, from `start` to its end.
-    Node { id: Id, start: u64 },
+    Node {
+        /// The object that holds them.
+        id: Id,
+        /// The first byte, counted from the start of that object.
+        start: u64,
+    },
 }
 
 /// A NumPy array; its bytes are another node, so that nothing is copied.
@@ -98,7 +122,9 @@ pub enum StoredBytes {
 pub struct ArrayView {
     /// `f8`, `i4`, ...
     pub dtype: String,
+    /// The length of each axis, the slowest first in C order.
     pub shape: Vec<usize>,
+    /// Whether the first axis varies fastest in the bytes, instead of the last.
     pub fortran: bool,
     /// `None` for an array whose state has not come.
     pub bytes: Option<Id>,
@@ -115,12 +141,15 @@ pub enum Global {
     Container,
     /// `bytes` and `bytearray`.
     Bytes,
+    /// `complex`, from a real and an imaginary part.
     Complex,
     /// `int`, `str`, ...: a plain type that stands for itself.
     Type(&'static str),
+    /// `argparse.Namespace`: a record of the options of a command.
     Namespace,
     /// `copyreg._reconstructor`: an instance by its class.
     Reconstruct,
+    /// `torch._utils._rebuild_tensor` and its kin: a view of a storage.
     RebuildTensor,
     /// Of elements whose type is an argument of its own.
     RebuildTyped,
@@ -132,6 +161,7 @@ pub enum Global {
     Parameter,
     /// A tensor that is empty until its state comes.
     Tensor,
+    /// `torch.FloatStorage` and its kin, by the type of their elements.
     StorageType(Scalar),
     /// Of numbers that share their bytes.
     PackedStorage,
@@ -141,11 +171,17 @@ pub enum Global {
     Device,
     /// `torch.serialization._get_layout`: its name.
     Layout,
+    /// `numpy.core.multiarray.scalar`: one number from its type and its bytes.
     NumpyScalar,
+    /// `numpy.dtype`, from a code such as `f8`.
     NumpyDtype,
+    /// `numpy.ndarray`, as an argument of what makes arrays.
     NumpyArray,
+    /// `numpy.core.multiarray._reconstruct`: an array that is empty until its state comes.
     NumpyReconstruct,
+    /// `numpy.core.numeric._frombuffer`: an array from bytes, type, shape and order.
     NumpyFromBuffer,
+    /// `_codecs.encode`: bytes that an old protocol wrote as text.
     Encode,
     /// `torch.jit._pickle.build_intlist` and its kin: the list itself.
     TypedList,
@@ -271,10 +307,12 @@ impl Pickle {
         }
     }
 
+    /// The object that the whole pickle stands for.
     pub fn root(&self) -> Id {
         self.root
     }
 
+    /// The object of an `id` of this pickle.
     pub fn node(&self, id: Id) -> &Node {
         &self.nodes[id.0 as usize]
     }

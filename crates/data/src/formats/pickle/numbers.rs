@@ -11,6 +11,7 @@ use std::path::{Path, PathBuf};
 #[derive(Debug, Clone)]
 pub struct StoredArray {
     dtype: Dtype,
+    /// The length of each axis, the slowest first in C order.
     pub shape: Vec<usize>,
     fortran: bool,
     place: Place,

@@ -3,9 +3,13 @@
 /// The element types of tensors.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Scalar {
+    /// Double precision.
     F64,
+    /// Single precision.
     F32,
+    /// Half precision: five bits of exponent, ten of fraction.
     F16,
+    /// bfloat16: eight bits of exponent, seven of fraction.
     BF16,
     /// Eight bits, four of them exponent.
     F8E4M3,
@@ -13,21 +17,35 @@ pub enum Scalar {
     F8E5M2,
     /// Eight bits in a form that is not read: FNUZ, or exponent alone.
     F8Other,
+    /// Signed, 64 bits.
     I64,
+    /// Signed, 32 bits.
     I32,
+    /// Signed, 16 bits.
     I16,
+    /// Signed, 8 bits.
     I8,
+    /// Unsigned, 64 bits.
     U64,
+    /// Unsigned, 32 bits.
     U32,
+    /// Unsigned, 16 bits.
     U16,
+    /// Unsigned, 8 bits.
     U8,
+    /// A byte that is 0 or 1.
     Bool,
+    /// Complex, two numbers of 64 bits: not read.
     C128,
+    /// Complex, two numbers of 32 bits: not read.
     C64,
+    /// Complex, two numbers of 16 bits: not read.
     C32,
     /// Quantised: what the numbers mean stands beside them.
     QI32,
+    /// Quantised, signed, 8 bits: not read.
     QI8,
+    /// Quantised, unsigned, 8 bits: not read.
     QU8,
 }
 
@@ -178,7 +196,9 @@ impl Scalar {
 /// A storage of a torch archive: the member `data/<key>`.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Storage {
+    /// Its name in the checkpoint, which views of the same memory share.
     pub key: String,
+    /// The type of its elements.
     pub scalar: Scalar,
     /// Declared number of elements.
     pub elements: u64,
@@ -187,9 +207,11 @@ pub struct Storage {
 /// A strided view of a storage.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct TensorView {
+    /// The storage that it is a view of.
     pub storage: Storage,
     /// In elements.
     pub offset: u64,
+    /// The length of each axis, in elements; none for a single number.
     pub shape: Vec<u64>,
     /// In elements.
     pub strides: Vec<u64>,

@@ -17,19 +17,24 @@ use std::path::Path;
 /// How a member's bytes lie in the archive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Method {
+    /// As they are.
     Stored,
+    /// Compressed by deflate.
     Deflated,
 }
 
 /// One member, as the central directory and its local header agree on it.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ZipEntry {
+    /// As the archive writes it, folders included; no other member has it.
     pub name: String,
+    /// How its bytes are stored.
     pub method: Method,
     /// Bytes in the archive.
     pub compressed: u64,
     /// Bytes after decompression, as declared (enforced while reading).
     pub size: u64,
+    /// Of the uncompressed bytes, as declared (compared once the member has been read to its end).
     pub crc32: u32,
     /// Where the member's data starts in the file.
     pub data_offset: u64,

@@ -7,11 +7,15 @@ const MOST_PIXELS: u64 = 40_000_000;
 /// What the first sequence parameter set says.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Sequence {
+    /// `profile_idc`: 66 Baseline, 77 Main, 100 High, ...
     pub profile: u8,
+    /// Pixels, without what is cropped.
     pub width: u32,
+    /// Pixels, without what is cropped.
     pub height: u32,
     /// 0 grey, 1 4:2:0, 2 4:2:2, 3 4:4:4.
     pub chroma_format: u32,
+    /// Bits of a luma or a chroma sample, whichever has more.
     pub bit_depth: u32,
     /// Interlaced coding is possible.
     pub interlaced: bool,

@@ -5,16 +5,24 @@
 pub enum ConvWindow {
     /// 3 x 3 within each frame. Stride 1: zeros around the frame. Stride 2: zeros to the right and below only.
     Space {
+        /// Frames of all samples together.
         frames: usize,
+        /// Of an input frame, pixels.
         height: usize,
+        /// Of an input frame, pixels.
         width: usize,
+        /// 1, or 2 to halve height and width.
         stride: usize,
     },
     /// 3 along time, ending at the present: the first frame is repeated in front, `3 - stride` times.
     Time {
+        /// Videos, one after the other.
         samples: usize,
+        /// Input frames of each.
         frames: usize,
+        /// Rows of each frame: height times width.
         pixels: usize,
+        /// 1, or 2 to halve the number of frames.
         stride: usize,
     },
 }

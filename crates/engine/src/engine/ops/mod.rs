@@ -237,7 +237,9 @@ pub fn sum_of_squares(x: Tensor<1>) -> f64 {
 pub struct AdamWStep {
     /// Gradients are multiplied by this first (clipping).
     pub gradient_scale: f64,
+    /// How much of the running mean and of the running mean square is kept, each in `[0, 1)`.
     pub betas: [f64; 2],
+    /// Added to the root of the corrected mean square.
     pub epsilon: f64,
     /// Learning rate times weight decay.
     pub decay: f64,

@@ -3,9 +3,11 @@
 /// Packed frames `[frames * height * width, C]` of one size to another.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Resize {
+    /// Frames of all samples together.
     pub frames: usize,
     /// Height and width.
     pub from: [usize; 2],
+    /// Height and width.
     pub to: [usize; 2],
 }
 
@@ -26,8 +28,11 @@ impl Resize {
 /// What one target element of an axis is made of: `lower (1 - weight) + upper weight`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Step {
+    /// Index of the source element at or before the place.
     pub lower: usize,
+    /// Index of the next one; the same at the end of the axis.
     pub upper: usize,
+    /// The share of the upper one, in `[0, 1)`.
     pub weight: f32,
 }
 

@@ -10,6 +10,7 @@ use ndarray::Array2;
 /// Pixels of one record.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Pixels {
+    /// Colour; grey of eight bits comes as three equal channels.
     Rgb(Image),
     /// Depth maps in millimetres.
     Grey16(Array2<u16>),
@@ -107,16 +108,19 @@ impl Pictures {
         Ok(pictures)
     }
 
+    /// How many pictures the stream has.
     #[must_use]
     pub fn len(&self) -> usize {
         self.entries.len()
     }
 
+    /// Whether there is no picture; an opened stream has at least one.
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.entries.is_empty()
     }
 
+    /// The stream that the pictures are of.
     #[must_use]
     pub fn stream(&self) -> StreamId {
         self.stream

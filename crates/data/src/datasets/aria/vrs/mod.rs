@@ -32,7 +32,9 @@ const INDEX_ENTRY: usize = 19;
 /// A stream: the kind of device and which one of that kind. Written `214-1`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub struct StreamId {
+    /// The kind of device, as VRS numbers them: 214 is Aria's colour camera.
     pub kind: i32,
+    /// Which one of that kind, from 1.
     pub instance: u16,
 }
 
@@ -44,6 +46,7 @@ impl StreamId {
     /// The map from the device's clock to the studio's timecode.
     pub const TIMECODE: StreamId = StreamId::new(285, 2);
 
+    /// The stream written `kind-instance`.
     #[must_use]
     pub const fn new(kind: i32, instance: u16) -> Self {
         StreamId { kind, instance }
@@ -59,9 +62,13 @@ impl fmt::Display for StreamId {
 /// What a record is for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
+    /// Inner state of the device; not read here.
     State,
+    /// How the device is set: of a camera the size and format of its pixels.
     Configuration,
+    /// What the device measured: one picture, some samples of a sensor, or a pair of clock times.
     Data,
+    /// The stream's tags, in files that do not have them in the description.
     Tags,
 }
 
@@ -96,14 +103,18 @@ pub struct Entry {
     pub timestamp: f64,
     /// Bytes, header included.
     pub size: u32,
+    /// The stream it belongs to.
     pub stream: StreamId,
+    /// What it is for.
     pub kind: Kind,
 }
 
 /// A record's header and payload.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Record {
+    /// Where it was found.
     pub entry: Entry,
+    /// Which layout the payload has: the version in the names of the `DL:` and `RF:` tags.
     pub format_version: u32,
     /// Uncompressed.
     pub payload: Vec<u8>,
@@ -112,6 +123,7 @@ pub struct Record {
 /// Tags of one stream.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Tags {
+    /// Written by the program that recorded: serial numbers, calibration, names of devices.
     pub user: BTreeMap<String, String>,
     /// Written by the library: how records are laid out.
     pub vrs: BTreeMap<String, String>,
@@ -123,7 +135,9 @@ pub struct Vrs {
     path: PathBuf,
     chunks: Vec<Chunk>,
     record_header: u64,
+    /// Of the file as a whole, by name.
     pub tags: BTreeMap<String, String>,
+    /// Tags by stream: of every stream in the description, those whose index is not kept included.
     pub streams: BTreeMap<StreamId, Tags>,
     /// In the order of the file, which is the order of time.
     pub entries: Vec<Entry>,
@@ -183,6 +197,7 @@ impl Vrs {
         Ok(vrs)
     }
 
+    /// The file that was opened, the first where it is cut into chunks.
     #[must_use]
     pub fn path(&self) -> &Path {
         &self.path
