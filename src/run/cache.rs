@@ -24,7 +24,9 @@ pub const MANIFEST: &str = "manifest.json";
 /// What decided an artifact's bytes, for the reader of its manifest.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Recipe {
+    /// The op that made it.
     pub op: String,
+    /// The op's version when it made it; another version is another artifact.
     pub version: u32,
     /// `None` for ops without randomness, so that seeds share what they make.
     pub seed: Option<u64>,
@@ -98,7 +100,9 @@ impl<'de> Deserialize<'de> for Key {
 pub struct Manifest {
     /// The artifact's type: `clips`, `tokenizer`, ...
     pub kind: String,
+    /// The artifact's own address, by which a manifest in the wrong place is noticed.
     pub key: Key,
+    /// What decided its bytes.
     pub recipe: Recipe,
     /// What the op says of it.
     pub contents: Value,
@@ -109,16 +113,20 @@ pub struct Manifest {
 /// One file of an artifact.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct FileHash {
+    /// The file's size.
     pub bytes: u64,
+    /// The hash of its content, in hexadecimal.
     pub blake3: String,
 }
 
 /// How an artifact came to be; kept beside it, not in it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Made {
+    /// The op that made it.
     pub op: String,
     /// Of work, over all attempts.
     pub seconds: f64,
+    /// Name of the machine that made it.
     pub host: String,
     /// UTC.
     pub at: String,
@@ -129,6 +137,7 @@ pub struct Made {
 /// What a look at a key finds.
 #[derive(Debug)]
 pub enum Entry {
+    /// There is nothing.
     Absent,
     /// The artifact, with its manifest and every file at its size.
     Whole(Box<Manifest>),
@@ -148,10 +157,12 @@ impl Cache {
         Self::new(runs.join("cache"))
     }
 
+    /// The cache in a directory, which is made when something is put there.
     pub fn new(root: impl Into<PathBuf>) -> Self {
         Self { root: root.into() }
     }
 
+    /// The directory that holds all of it.
     pub fn root(&self) -> &Path {
         &self.root
     }
@@ -169,6 +180,7 @@ impl Cache {
             .join(format!("{name}.{extension}"))
     }
 
+    /// The lock file of `key`, beside its artifact: who makes the artifact holds it.
     pub fn lock_path(&self, key: &Key) -> PathBuf {
         self.beside(key, "lock")
     }
@@ -353,8 +365,11 @@ impl Cache {
 /// One name in the cache: an artifact (no extension), or what lies beside it (`lock`, `making`, `made.json`, `damaged`).
 #[derive(Debug)]
 pub struct Leaf {
+    /// The artifact that it is, or lies beside.
     pub key: Key,
+    /// What follows the first dot of its name: empty, `lock`, `making`, `made.json`, `damaged`.
     pub extension: String,
+    /// Where it lies.
     pub path: PathBuf,
 }
 
