@@ -10,7 +10,12 @@ pub enum Failure {
     /// The user's input; has been reported already.
     Reported,
     /// The user's input: what is wrong, and the way out (empty for none).
-    Input { message: String, help: String },
+    Input {
+        /// What is wrong, in a sentence or two, as it is printed.
+        message: String,
+        /// The way out, as it is printed; empty for none.
+        help: String,
+    },
     /// The machine, or a bug.
     Machine(String),
     /// Anything that has been reported already and ends the process with this code.

@@ -6,7 +6,9 @@ use serde::{Deserialize, Serialize};
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Better {
+    /// Smaller values are better: errors and distances.
     Lower,
+    /// Larger values are better: accuracies and similarities.
     Higher,
 }
 
@@ -28,6 +30,7 @@ pub struct Column {
     pub name: String,
     /// Empty for numbers without a unit.
     pub unit: String,
+    /// Which direction of its values is an improvement.
     pub better: Better,
 }
 
@@ -54,9 +57,11 @@ impl Column {
 /// A column that a set of metrics fills.
 #[derive(Debug, Clone, Copy)]
 pub struct ColumnInfo {
+    /// As in [`Column::name`], `@space` included: `depth.abs_rel@depth`.
     pub name: &'static str,
     /// Empty for numbers without a unit.
     pub unit: &'static str,
+    /// Which direction of its values is an improvement.
     pub better: Better,
     /// One line about it.
     pub about: &'static str,

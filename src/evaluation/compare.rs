@@ -15,7 +15,9 @@ use std::collections::{BTreeMap, BTreeSet};
 /// One row to be: an arm, a run, another system. Several scores are the same thing under several seeds.
 #[derive(Debug, Clone)]
 pub struct Method {
+    /// What its row is called; [`CompareSettings::baseline`] refers to it.
     pub label: String,
+    /// One per seed, all of the same thing; without any the row has no values.
     pub seeds: Vec<Scores>,
 }
 
@@ -29,6 +31,7 @@ pub struct CompareSettings {
     pub baseline: Option<String>,
     /// Entrants that are tested against another one: of each, the name of the entrant that differs in the one thing it is about.
     pub baselines: BTreeMap<String, String>,
+    /// The confidence intervals: their level, what varies in them, and how they are drawn.
     pub interval: IntervalSettings,
     /// Show the trivial baselines.
     pub trivial_baselines: bool,
@@ -49,14 +52,33 @@ impl Default for CompareSettings {
 /// Why scores cannot stand in one table.
 #[derive(Debug, thiserror::Error, PartialEq, Eq)]
 pub enum CompareError {
+    /// No entrant has any scores.
     #[error("nothing to compare")]
     Nothing,
+    /// The entrants have no clip in common: nothing can be paired.
     #[error("no clip is common to all: `{first}` and `{other}` were evaluated on different clips")]
-    NoCommonClips { first: String, other: String },
+    NoCommonClips {
+        /// Label of the first entrant with scores, whose clips were the start.
+        first: String,
+        /// Label of the entrant at which no clip was left.
+        other: String,
+    },
+    /// [`CompareSettings::baseline`] is the label of no entrant.
     #[error("no entrant is called `{name}`; there are {known:?}")]
-    UnknownBaseline { name: String, known: Vec<String> },
+    UnknownBaseline {
+        /// The label that was asked for.
+        name: String,
+        /// Labels of all entrants.
+        known: Vec<String>,
+    },
+    /// An element of [`CompareSettings::columns`] fits no column of any entrant.
     #[error("no entrant has a column `{name}`")]
-    UnknownColumn { name: String, known: Vec<String> },
+    UnknownColumn {
+        /// The column that was asked for, as written.
+        name: String,
+        /// Names of all columns that any entrant has.
+        known: Vec<String>,
+    },
 }
 
 /// The table of `entrants`, with `published` rows below.

@@ -60,6 +60,7 @@ const FARTHEST_DISPARITY: f64 = 1000.0;
 /// Depth errors of one clip.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct DepthErrors {
+    /// Pixels that were scored, over all frames of the clip.
     pub n_valid: usize,
     /// Mean of `|a - g| / g`.
     pub abs_rel: Option<f64>,
@@ -67,6 +68,7 @@ pub struct DepthErrors {
     pub delta_1_25: Option<f64>,
     /// Negative means that the prediction grows where the truth shrinks: a warning.
     pub scale: Option<f64>,
+    /// What the fit adds to the scaled prediction: metres, or 1/metres in disparity space; 0 where only a scale is fitted.
     pub shift: Option<f64>,
     /// A constant prediction (or nothing to score): scale and shift are not unique.
     pub degenerate: bool,

@@ -54,16 +54,37 @@ pub trait Pairs: Sync {
 /// Why an evaluation stops.
 #[derive(Debug, thiserror::Error)]
 pub enum EvaluationError {
+    /// The suite names a metric that is no column.
     #[error(transparent)]
     Metric(#[from] UnknownMetric),
+    /// A clip could not be read: the truth, the prediction or the tokenizer floor.
     #[error("clip `{clip}`: {error}")]
-    Load { clip: String, error: LoadError },
+    Load {
+        /// Its id.
+        clip: String,
+        /// Why, in the words of whoever holds the clips.
+        error: LoadError,
+    },
+    /// A metric refused to score a clip; nothing after it is evaluated.
     #[error("clip `{clip}`: refused: {refusal}")]
-    Refused { clip: String, refusal: MetricError },
+    Refused {
+        /// Its id.
+        clip: String,
+        /// What was wrong with its values.
+        refusal: MetricError,
+    },
+    /// What is computed over all clips was refused: embeddings or descriptors that do not fit or have no direction.
     #[error("motion embeddings: {0}")]
     Embeddings(MetricError),
+    /// No clip of the suite has a prediction.
     #[error("none of the {truth} clips has a prediction; do the clip ids agree (`{example}`)?")]
-    NoOverlap { truth: usize, example: String },
+    NoOverlap {
+        /// How many true clips the suite chose.
+        truth: usize,
+        /// Id of the first true clip, to compare with those of the predictions; empty where there is none.
+        example: String,
+    },
+    /// `progress` asked to stop.
     #[error("interrupted")]
     Interrupted,
 }

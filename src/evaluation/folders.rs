@@ -112,8 +112,10 @@ impl Pairs for Folders {
 /// Why predictions cannot be scored against clips in shards.
 #[derive(Debug, thiserror::Error)]
 pub enum StoredError {
+    /// A prediction has no true clip; holds its clip id.
     #[error("clip `{0}` was predicted but is not among the true clips")]
     NotTrue(String),
+    /// The tokenizer floor that the predictions bring cannot be opened.
     #[error(transparent)]
     Floor(#[from] PredictionsError),
 }

@@ -9,6 +9,7 @@ pub const VALID_RANGE: (f64, f64) = (-0.2, 1.2);
 /// Gaze errors of one clip; unit-free, the image is `[0, 1]^2`.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct GazeErrors {
+    /// Frames that were scored.
     pub n_valid: usize,
     /// Mean squared difference over valid frames and both coordinates (half the mean squared distance).
     pub mse: Option<f64>,

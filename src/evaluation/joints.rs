@@ -15,6 +15,7 @@ use ndarray::{ArrayView1, ArrayView2, ArrayView3, Axis};
 /// What counts.
 #[derive(Debug, Clone, Copy)]
 pub enum Valid<'a> {
+    /// Every joint of every frame.
     All,
     /// `[T]`
     Frames(ArrayView1<'a, bool>),
@@ -45,34 +46,44 @@ impl Valid<'_> {
 pub struct JointErrors {
     /// Frames with at least one valid joint.
     pub n_frames: usize,
+    /// Valid (frame, joint) pairs.
     pub n_points: usize,
+    /// Mean distance without alignment; `None` without a valid joint.
     pub mpjpe: Option<f64>,
+    /// Mean distance with both roots at the origin; `None` where no frame has a valid root.
     pub ra: Option<f64>,
     /// Present also when [`Self::ga_degenerate`]: then it is one optimum of many and must not be averaged.
     pub ga: Option<f64>,
+    /// What the clip's similarity multiplies the prediction by, without unit; `None` without a valid joint.
     pub ga_scale: Option<f64>,
+    /// The clip's similarity has no unique optimum: points that coincide, lie on a line, or fit a mirror image best.
     pub ga_degenerate: bool,
     /// Mean over the frames whose alignment is unique.
     pub pa: Option<f64>,
+    /// Frames with a valid joint whose own similarity is not unique: they are not in [`Self::pa`].
     pub pa_degenerate_frames: usize,
 }
 
 impl JointErrors {
+    /// MPJPE as the clip's score.
     #[must_use]
     pub fn mpjpe_outcome(&self) -> Outcome {
         Outcome::of(self.mpjpe)
     }
 
+    /// RA-MPJPE as the clip's score; null where no frame has a valid root.
     #[must_use]
     pub fn ra_outcome(&self) -> Outcome {
         Outcome::of(self.ra)
     }
 
+    /// GA-MPJPE as the clip's score; degenerate where the similarity is not unique.
     #[must_use]
     pub fn ga_outcome(&self) -> Outcome {
         Outcome::unless(self.ga_degenerate, self.ga)
     }
 
+    /// PA-MPJPE as the clip's score; degenerate where the similarity of no frame is unique.
     #[must_use]
     pub fn pa_outcome(&self) -> Outcome {
         match self.pa {

@@ -70,7 +70,9 @@ pub trait MetricSet: Sync {
 /// A true and a predicted clip.
 #[derive(Debug, Clone, Copy)]
 pub struct Pair<'a> {
+    /// The ground truth; its validity says what is scored.
     pub truth: &'a Clip,
+    /// What is scored: of the system, of a baseline, or of the tokenizers.
     pub prediction: &'a Clip,
     /// Which true depths are scored.
     pub depth: super::depth::Scored,
@@ -114,7 +116,9 @@ impl ClipScore {
 /// Descriptors of one clip.
 #[derive(Debug, Clone)]
 pub struct Features {
+    /// Of the predicted clip; as many numbers as [`Self::truth`].
     pub predicted: Array1<f64>,
+    /// Of the true clip.
     pub truth: Array1<f64>,
 }
 
@@ -130,14 +134,18 @@ pub struct AllClips<'a> {
 /// Motion embeddings that the user brings, one row per clip: TMR's 256-d mean vectors.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Embeddings {
+    /// Of the predictions, `[n, d]`.
     pub predicted: Array2<f64>,
+    /// Of the true clips, `[n, d]`, in the same order.
     pub truth: Array2<f64>,
 }
 
 /// A column that was filled over all clips.
 #[derive(Debug, Clone)]
 pub enum OverClips {
+    /// One outcome per clip, in order: values that depend on the other clips too.
     PerClip(Vec<Outcome>),
+    /// One number for the whole set of clips.
     Set(SetScore),
 }
 
@@ -161,7 +169,9 @@ pub trait Baseline: Send + Sync {
 /// Values `[T, a, b]` and which of them count, `[T, a]`; without validity every finite one does.
 #[derive(Debug)]
 pub struct Samples<'a> {
+    /// `[T, a, b]`, frames first.
     pub values: ArrayView3<'a, f32>,
+    /// `[T, a]`; `None` counts every finite value.
     pub valid: Option<ArrayView2<'a, bool>>,
 }
 

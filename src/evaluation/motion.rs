@@ -183,6 +183,7 @@ fn mean_and_deviation(values: &[f64]) -> (f64, f64) {
 /// `kin_fid` and `kin_cos` of a set of predicted motions against the true ones.
 #[derive(Debug, Clone, PartialEq)]
 pub struct KinScores {
+    /// Clips in the set.
     pub n: usize,
     /// Width of the descriptor.
     pub dim: usize,

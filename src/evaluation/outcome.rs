@@ -5,6 +5,7 @@ use serde::{Deserialize, Deserializer, Serialize, Serializer};
 /// The score of one clip in one column. Only numbers enter averages; the others are counted beside them.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Outcome {
+    /// A value, in the column's unit.
     Number(f64),
     /// Nothing valid to score.
     Null,
@@ -29,6 +30,7 @@ impl Outcome {
         }
     }
 
+    /// The value of a number; `None` of the others.
     #[must_use]
     pub fn number(self) -> Option<f64> {
         match self {
@@ -72,37 +74,76 @@ impl<'de> Deserialize<'de> for Outcome {
 /// Why a metric refuses to score. A refusal ends the evaluation: silently skipped garbage would look like a good score.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum MetricError {
+    /// A value that would be scored is NaN or infinite.
     #[error("{field}: not finite at {position:?} on a scored element")]
     NotFinite {
+        /// What holds it, in words: `depth prediction`, `estimated camera`, ...
         field: &'static str,
+        /// Its index, frame (or row) first; for a pose or a joint, the index of the whole.
         position: Vec<usize>,
     },
+    /// The rotation part of a pose is not orthonormal, or mirrors.
     #[error(
         "{field}: the rotation of pose {index} is not a rotation (off by {error:.1e}, at most 1e-4)"
     )]
     NotARotation {
+        /// Which trajectory the pose belongs to.
         field: &'static str,
+        /// Its index in the trajectory, from 0.
         index: usize,
+        /// Largest deviation of an entry of `RᵀR` from the identity, or of `det R` from 1.
         error: f64,
     },
+    /// A pose matrix is no rigid motion in homogeneous coordinates.
     #[error("{field}: the fourth row of pose {index} is not 0 0 0 1")]
-    NotAffine { field: &'static str, index: usize },
+    NotAffine {
+        /// Which trajectory the pose belongs to.
+        field: &'static str,
+        /// Its index in the trajectory, from 0.
+        index: usize,
+    },
+    /// Arrays that are compared do not fit, or an argument (a root joint, a step between poses) does not fit them.
     #[error("{field}: shape {found:?} does not fit {expected:?}")]
     Shape {
+        /// What has the shape: `joints`, `gaze`, `embeddings`, ...
         field: &'static str,
+        /// The shape that was given, usually the prediction's.
         found: Vec<usize>,
+        /// The shape that was needed, usually the truth's.
         expected: Vec<usize>,
     },
+    /// An embedding is all zeros, so that it has no cosine with another.
     #[error("embedding {row} has length zero: it has no direction")]
-    ZeroEmbedding { row: usize },
+    ZeroEmbedding {
+        /// Its row, from 0.
+        row: usize,
+    },
+    /// A motion is too short for the features of the motion encoder.
     #[error("a motion of {found} frames; its features need at least {needed}")]
-    TooShort { found: usize, needed: usize },
+    TooShort {
+        /// Frames that it has, at the rate of the features.
+        found: usize,
+        /// Frames that it must have at least.
+        needed: usize,
+    },
+    /// A joint lies within a micrometre of its parent: features need the bone's direction.
     #[error(
         "joints: the bone to joint {joint} has no length in frame {frame}: its direction is not known"
     )]
-    NoBone { frame: usize, joint: usize },
+    NoBone {
+        /// Index of the frame, at the rate of the features.
+        frame: usize,
+        /// Index among the 22 joints that features are made of.
+        joint: usize,
+    },
+    /// A token is negative, or not below the size of its codebook.
     #[error("code {code} is outside the codebook of {size}")]
-    CodeOutside { code: i64, size: usize },
+    CodeOutside {
+        /// The token.
+        code: i64,
+        /// Number of codes in the codebook.
+        size: usize,
+    },
 }
 
 /// Mean of the numbers that `values` yields; `None` when there is none.

@@ -15,6 +15,7 @@ pub struct Published {
     pub source: String,
     /// Under which conditions: data, clips, training, alignment. Printed below every table that shows the rows.
     pub conditions: String,
+    /// The printed rows, in the order in which tables show them.
     pub rows: Vec<PublishedRow>,
 }
 
@@ -22,6 +23,7 @@ pub struct Published {
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, schemars::JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct PublishedRow {
+    /// Name of the system, as tables show it.
     pub system: String,
     /// By column, in the column's unit.
     pub values: BTreeMap<String, f64>,

@@ -7,9 +7,12 @@ use std::fmt::Write as _;
 /// How a table is written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Format {
+    /// Plain text with aligned columns.
     #[default]
     Terminal,
+    /// A Markdown table.
     Markdown,
+    /// A LaTeX table, special characters escaped.
     Latex,
     /// One line per cell, every number in full.
     Csv,

@@ -5,7 +5,9 @@
 pub struct Runtime {
     /// Clips after the warm-up.
     pub n: usize,
+    /// Of an even number of clips, the mean of the middle two.
     pub median: Option<f64>,
+    /// Arithmetic mean.
     pub mean: Option<f64>,
     /// 90th percentile by nearest rank.
     pub p90: Option<f64>,

@@ -11,11 +11,13 @@ use std::path::Path;
 pub struct Scores {
     /// Version of this layout.
     pub format: u32,
+    /// Name of the suite that was evaluated.
     pub suite: String,
     /// Who predicted.
     pub system: String,
     /// Clip ids, in the order of every column's values.
     pub clips: Vec<String>,
+    /// The system's own scores.
     pub own: ScoreSet,
     /// `still camera`, `image centre`, `mean pose`, `mean depth image`, `mean value`, `tokenizer floor`: only the columns they have.
     pub baselines: BTreeMap<String, ScoreSet>,
@@ -36,21 +38,27 @@ pub const FORMAT: u32 = 1;
 /// Columns of one system.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct ScoreSet {
+    /// Columns with an outcome per clip, in the order of the suite.
     pub columns: Vec<ColumnScores>,
+    /// Numbers of the whole set of clips.
     pub sets: Vec<SetScore>,
 }
 
 /// One column, one outcome per clip.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct ColumnScores {
+    /// Name, unit and direction of the values.
     pub column: Column,
+    /// One per clip, in the order of [`Scores::clips`].
     pub values: Vec<Outcome>,
 }
 
 /// A number that only a whole set of clips has.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SetScore {
+    /// Name, unit and direction of the number.
     pub column: Column,
+    /// The number, in the column's unit; `None` where it could not be computed.
     pub value: Option<f64>,
     /// Clips in the set: such numbers are comparable only at equal n.
     pub n: usize,
@@ -71,11 +79,13 @@ impl SetScore {
 }
 
 impl ScoreSet {
+    /// The column of this full name, `@space` included.
     #[must_use]
     pub fn column(&self, name: &str) -> Option<&ColumnScores> {
         self.columns.iter().find(|c| c.column.name == name)
     }
 
+    /// The set-wide number of this full name.
     #[must_use]
     pub fn set(&self, name: &str) -> Option<&SetScore> {
         self.sets.iter().find(|c| c.column.name == name)
@@ -85,19 +95,31 @@ impl ScoreSet {
 /// Why a scores file cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum ScoresError {
+    /// The file cannot be read or written.
     #[error("{path}: {error}")]
     Io {
+        /// The scores file.
         path: String,
+        /// What the file system said.
         #[source]
         error: std::io::Error,
     },
+    /// The text is not JSON of this layout.
     #[error("{path}: not a scores file: {error}")]
     Json {
+        /// The scores file.
         path: String,
+        /// What is wrong, with line and column.
         error: serde_json::Error,
     },
+    /// The file has another format version, or a column does not have one value per clip.
     #[error("{path}: {reason}")]
-    Content { path: String, reason: String },
+    Content {
+        /// The scores file.
+        path: String,
+        /// What does not fit, in words.
+        reason: String,
+    },
 }
 
 /// The file of a scores artifact.

@@ -9,11 +9,15 @@ use serde::{Deserialize, Serialize};
 /// A column of outcomes in one line. Only numbers enter the mean.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct Summary {
+    /// `None` without a number.
     pub mean: Option<f64>,
     /// Standard error of the mean, `std(ddof=1) / sqrt(n)`; `None` below two numbers.
     pub standard_error: Option<f64>,
+    /// How many outcomes are numbers.
     pub n: usize,
+    /// How many outcomes are null: nothing valid to score.
     pub n_null: usize,
+    /// How many outcomes are degenerate.
     pub n_degenerate: usize,
 }
 
@@ -40,8 +44,11 @@ fn deviation(values: &[f64]) -> Option<f64> {
 /// A confidence interval and where it comes from.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Interval {
+    /// Lower end, in the unit of the values.
     pub low: f64,
+    /// Upper end, in the unit of the values.
     pub high: f64,
+    /// What was varied to get it.
     pub over: Over,
 }
 
@@ -56,11 +63,13 @@ pub enum Over {
 }
 
 impl Interval {
+    /// Whether `value` lies in it; both ends do.
     #[must_use]
     pub fn contains(&self, value: f64) -> bool {
         (self.low..=self.high).contains(&value)
     }
 
+    /// Distance of its ends, in the unit of the values.
     #[must_use]
     pub fn width(&self) -> f64 {
         self.high - self.low

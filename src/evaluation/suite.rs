@@ -54,6 +54,7 @@ impl Default for Suite {
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("no metric `{name}`")]
 pub struct UnknownMetric {
+    /// The name, as the suite has it.
     pub name: String,
     /// Every name there is, for a suggestion.
     pub known: Vec<&'static str>,

@@ -8,8 +8,11 @@ use serde::{Deserialize, Serialize};
 /// A table of systems against columns.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct Table {
+    /// Printed above in text and Markdown; empty for none.
     pub title: String,
+    /// In the order of every row's cells.
     pub columns: Vec<Column>,
+    /// From top to bottom.
     pub rows: Vec<Row>,
     /// What must be read with the numbers; printed below.
     pub notes: Vec<String>,
@@ -30,7 +33,9 @@ pub enum RowKind {
 /// One line.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Row {
+    /// What the row is called: an arm, a system, a baseline.
     pub label: String,
+    /// Where its numbers come from.
     pub kind: RowKind,
     /// One per column.
     pub cells: Vec<Cell>,
@@ -39,12 +44,17 @@ pub struct Row {
 /// One number with everything that qualifies it.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct Cell {
+    /// The number, in the column's unit: a mean over clips, then over seeds.
     pub value: Option<f64>,
+    /// Its confidence interval; `None` where there are too few clips and seeds, or none was asked for.
     pub interval: Option<Interval>,
     /// Clips that the value is a mean of.
     pub n: usize,
+    /// Seeds that the value is a mean of; 0 for published rows.
     pub seeds: usize,
+    /// Clips with nothing valid to score; of several seeds, the largest count.
     pub n_null: usize,
+    /// Clips whose alignment is not unique; of several seeds, the largest count.
     pub n_degenerate: usize,
     /// Against the table's baseline row, on common clips.
     pub difference: Option<Difference>,

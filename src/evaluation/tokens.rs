@@ -5,9 +5,11 @@ use super::outcome::MetricError;
 /// Use of a codebook of `size` codes.
 #[derive(Debug, Clone, PartialEq, Default, serde::Serialize)]
 pub struct CodebookUse {
+    /// Number of codes in the codebook.
     pub size: usize,
     /// Usage is bounded by `n_tokens / size`: print it beside.
     pub n_tokens: usize,
+    /// Different codes that were used.
     pub distinct: usize,
     /// Distinct codes over the size; `None` without tokens.
     pub usage: Option<f64>,
@@ -22,6 +24,7 @@ pub struct CodeCounts {
 }
 
 impl CodeCounts {
+    /// Counts for a codebook of `size` codes, all zero.
     #[must_use]
     pub fn new(size: usize) -> Self {
         Self {
@@ -40,6 +43,7 @@ impl CodeCounts {
         Ok(())
     }
 
+    /// The use of the codebook by all codes added so far.
     #[must_use]
     pub fn summary(&self) -> CodebookUse {
         let total: u64 = self.counts.iter().sum();

@@ -11,7 +11,9 @@ use ndarray::ArrayView3;
 /// A pose as metrics take it: a rotation matrix that was checked, and a position in metres.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Pose {
+    /// From the camera's axes to the world's.
     pub rotation: Matrix3<f64>,
+    /// The camera's origin in the world, metres.
     pub position: Vector3<f64>,
 }
 
@@ -99,20 +101,31 @@ fn check(pose: &Pose, index: usize, field: &'static str) -> Result<(), MetricErr
 /// Trajectory errors of one clip; metres and degrees.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct TrajectoryErrors {
+    /// Poses that were scored.
     pub n_poses: usize,
+    /// Pairs `delta` samples apart, both of them scored poses.
     pub n_pairs: usize,
+    /// Root mean square of ATE over poses, metres.
     pub ate_rmse: Option<f64>,
+    /// Mean of ATE over poses, metres.
     pub ate_mean: Option<f64>,
+    /// Root mean square of RTE over pairs, metres; `None` without a pair.
     pub rte_rmse: Option<f64>,
+    /// Mean of RTE over pairs, metres; `None` without a pair.
     pub rte_mean: Option<f64>,
     /// The translation of `(P_i⁻¹ P_{i+Δ}) (Q_i⁻¹ Q_{i+Δ})⁻¹`, the order of the TUM benchmark's script.
     pub rte_tum_rmse: Option<f64>,
+    /// Root mean square of RRE over pairs, degrees; `None` without a pair.
     pub rre_rmse: Option<f64>,
+    /// Mean of RRE over pairs, degrees; `None` without a pair.
     pub rre_mean: Option<f64>,
     /// RTE and RRE of a camera that never moves.
     pub still_rte_rmse: Option<f64>,
+    /// Mean RTE of a camera that never moves, metres.
     pub still_rte_mean: Option<f64>,
+    /// Root mean square of the RRE of a camera that never moves, degrees.
     pub still_rre_rmse: Option<f64>,
+    /// Mean RRE of a camera that never moves, degrees.
     pub still_rre_mean: Option<f64>,
     /// The alignment that was applied to the estimate.
     pub alignment: Option<Similarity>,
@@ -121,11 +134,13 @@ pub struct TrajectoryErrors {
 }
 
 impl TrajectoryErrors {
+    /// The root mean square of ATE as the clip's score, metres.
     #[must_use]
     pub fn ate(&self) -> Outcome {
         Outcome::unless(self.degenerate, self.ate_rmse)
     }
 
+    /// The root mean square of RTE as the clip's score, metres.
     #[must_use]
     pub fn rte(&self) -> Outcome {
         Outcome::unless(self.degenerate, self.rte_rmse)

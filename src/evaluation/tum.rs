@@ -11,27 +11,43 @@ use std::path::Path;
 /// Poses with their times in seconds; times never go back.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct TimedPoses {
+    /// Seconds, one per pose, as the file has them.
     pub times: Vec<f64>,
+    /// One per time.
     pub poses: Vec<Pose>,
 }
 
 /// Why a trajectory file cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum TumError {
+    /// The file cannot be read as lines of text.
     #[error(transparent)]
     Read(#[from] ReadError),
+    /// A line does not hold a pose, or is earlier than the line before.
     #[error("{path}:{line}: {reason}")]
     Line {
+        /// The trajectory file.
         path: String,
+        /// Number of the line, from 1.
         line: u64,
+        /// What is wrong with it, in words.
         reason: String,
     },
+    /// The file has nothing but comments and empty lines.
     #[error("{path}: no poses: a TUM trajectory has lines `timestamp tx ty tz qx qy qz qw`")]
-    Empty { path: String },
+    Empty {
+        /// The trajectory file.
+        path: String,
+    },
+    /// No pose of one trajectory has a simultaneous one in the other.
     #[error(
         "no two timestamps lie within {max_difference} s of each other; are both in seconds of the same clock?"
     )]
-    NoMatch { max_difference: f64 },
+    NoMatch {
+        /// Seconds within which two timestamps count as simultaneous.
+        max_difference: f64,
+    },
+    /// The matched poses cannot be scored.
     #[error(transparent)]
     Refused(#[from] MetricError),
 }

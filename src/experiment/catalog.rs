@@ -20,10 +20,13 @@ pub struct Catalog {
 
 /// A kind of registry entries.
 pub struct KindFacts {
+    /// The first key of its entries' files, and their folder in `registry/`: `masking`.
     pub kind: &'static str,
+    /// One line for `reviv list`.
     pub about: &'static str,
     /// Schema of the settings.
     pub schema: Value,
+    /// Settings with every default filled in; fails where they do not fit the schema.
     pub normalize: fn(Value) -> Result<Value, serde_json::Error>,
 }
 
@@ -32,6 +35,7 @@ pub struct KindFacts {
 pub struct EntryText {
     /// `registry/masking/uniform.yaml (built in)`.
     pub place: String,
+    /// The entry's YAML, as written.
     pub text: std::borrow::Cow<'static, str>,
 }
 

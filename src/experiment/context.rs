@@ -75,13 +75,17 @@ pub enum StageError {
     Input {
         /// A code of the families E05 or E06, usually.
         code: super::problem::Code,
+        /// What is wrong, in a sentence.
         message: String,
+        /// The way out; empty for none.
         help: String,
     },
     /// The machine: disk full, permission, a file that vanished.
     #[error("{path}: {error}")]
     Io {
+        /// The file or folder, as shown to the user.
         path: String,
+        /// What the file system said.
         #[source]
         error: std::io::Error,
     },

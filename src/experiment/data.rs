@@ -13,6 +13,7 @@ use std::path::{Path, PathBuf};
 /// The folder of a data set.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct DataRoot {
+    /// The folder; a relative path in `data.yaml` is taken from that file's own folder.
     pub path: PathBuf,
     /// Who says so: `data.yaml` or `REVIV_DATA_ADT`.
     pub set_by: String,

@@ -12,7 +12,9 @@ use serde::Serialize;
 /// One error or warning.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Diagnostic {
+    /// What kind of mistake it is; says too whether it is an error or a warning.
     pub code: Code,
+    /// Where it was written.
     pub span: Span,
     /// What is wrong, with the user's own words in backticks.
     pub message: String,
@@ -75,23 +77,32 @@ impl Diagnostic {
 /// Everything that was said about an experiment, with the texts it was said about.
 #[derive(Debug, Clone, Default)]
 pub struct Report {
+    /// As found; after [`Report::tidy`] without repetitions, errors first, by place.
     pub diagnostics: Vec<Diagnostic>,
+    /// The texts that the spans of the diagnostics lie in.
     pub sources: Sources,
 }
 
 /// A diagnostic for machines.
 #[derive(Debug, Serialize)]
 pub struct Record<'a> {
+    /// As in [`Diagnostic::code`].
     pub code: Code,
+    /// `error` or `warning`.
     pub severity: &'static str,
+    /// What is wrong.
     pub message: &'a str,
+    /// Name of the text it was written in: a file, a registry entry, `--set`.
     pub file: &'a str,
     /// From 1.
     pub line: usize,
     /// From 1, in characters.
     pub column: usize,
+    /// A few words about the marked place.
     pub label: &'a str,
+    /// What to know: which layer set it, which arm it is in.
     pub notes: &'a [String],
+    /// Ways out.
     pub help: &'a [String],
 }
 

@@ -14,6 +14,7 @@ pub struct Setting {
     pub form: String,
     /// The first line of its docs.
     pub about: String,
+    /// Its default, a registry reference by its name; `None` where the schema has none.
     pub default: Option<Value>,
 }
 

@@ -72,9 +72,13 @@ impl<T: Kind> JsonSchema for Entry<T> {
 
 /// A kind of the registry, linked in: `inventory::submit! { KindEntry::of::<MaskingSettings>() }`.
 pub struct KindEntry {
+    /// [`Kind::KIND`]: the first key of the entries' files.
     pub kind: &'static str,
+    /// [`Kind::ABOUT`]: one line for `reviv list`.
     pub about: &'static str,
+    /// The schema of the settings.
     pub schema: fn(&mut SchemaGenerator) -> Schema,
+    /// Settings with every default filled in; fails where they do not fit the settings struct.
     pub normalize: fn(Value) -> Result<Value, serde_json::Error>,
 }
 

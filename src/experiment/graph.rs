@@ -19,6 +19,7 @@ const PLAN_SEED: u64 = 0;
 pub struct Experiment {
     /// From `experiment:` or `sweep:`.
     pub name: String,
+    /// What it is for, from `about:`; empty where the file does not say.
     pub about: String,
     /// The file that was asked for.
     pub path: PathBuf,
@@ -39,7 +40,9 @@ pub struct Experiment {
 pub struct Cell {
     /// The arm's name; empty for a plain experiment. A grid point is `arm-key=value-key=value`.
     pub arm: String,
+    /// The seed of its stages, but for those that set their own.
     pub seed: u64,
+    /// Its stages and how they are connected.
     pub graph: Graph,
 }
 
@@ -57,6 +60,7 @@ impl Cell {
 /// The stages of one cell in topological order: inputs come before what reads them.
 #[derive(Clone, Default)]
 pub struct Graph {
+    /// A stage's edges refer to others by their index in this list.
     pub stages: Vec<Stage>,
     /// The keys beside the stages, for `reviv why`: `experiment`, `about`, `seed`, `params.x`.
     pub head: Vec<Head>,
@@ -65,8 +69,11 @@ pub struct Graph {
 /// A value of the experiment itself.
 #[derive(Debug, Clone)]
 pub struct Head {
+    /// Dotted key path.
     pub key: String,
+    /// As text on one line.
     pub value: String,
+    /// Where it was written, and what it replaced.
     pub trace: Trace,
 }
 
@@ -75,6 +82,7 @@ pub struct Head {
 pub struct Stage {
     /// The key in `stages:`; a stage of another experiment keeps its `file/stage` name.
     pub name: String,
+    /// What it does.
     pub op: &'static dyn AnyOp,
     /// Every setting, defaults filled in, registry references resolved, paths resolved.
     pub settings: Value,
@@ -96,6 +104,7 @@ pub struct Stage {
 /// What is connected to a port.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Edge {
+    /// The op's key for this input: `clips`, `tokenizers`.
     pub port: &'static str,
     /// Indices into [`Graph::stages`].
     pub from: Vec<usize>,

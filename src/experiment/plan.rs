@@ -11,6 +11,7 @@ use std::path::Path;
 /// A planned experiment.
 #[derive(Debug, Clone, Serialize)]
 pub struct Plan {
+    /// Name of the experiment or sweep.
     pub name: String,
     /// Labels of the cells: arm and seed.
     pub cells: Vec<String>,
@@ -38,17 +39,22 @@ pub struct DataToDo {
 pub struct PlannedStage {
     /// The stage's name in the experiment.
     pub name: String,
+    /// The op that does it.
     pub op: &'static str,
+    /// The type of its artifact.
     pub makes: ArtifactKind,
     /// The artifact's address.
     pub key: String,
+    /// Whether the artifact is there already.
     pub cached: bool,
     /// The cells that use it, as indices into [`Plan::cells`].
     pub cells: Vec<usize>,
+    /// What the artifact will be.
     pub description: Description,
     /// Resolved.
     #[serde(skip)]
     pub settings: Value,
+    /// Shapes, parameters, memory and FLOP, as far as they are known.
     pub plan: StagePlan,
 }
 

@@ -64,6 +64,7 @@ impl fmt::Display for Code {
 /// One thing wrong (or suspicious) with a stage's settings or edges.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Problem {
+    /// What kind of mistake it is; says too whether it is an error or a warning.
     pub code: Code,
     /// Where, relative to the stage: `tokenizer.codebook`, `tokenizers.1`; empty for the stage as a whole.
     pub key: String,

@@ -37,9 +37,13 @@ struct Slot {
 /// An entry as `reviv list` shows it.
 #[derive(Debug, Clone, PartialEq, Eq, serde::Serialize)]
 pub struct Listed {
+    /// The entry's first key: `masking`, `size`, `tokenizer`, ...
     pub kind: String,
+    /// The name by which experiments refer to it.
     pub name: String,
+    /// Its `about:`; empty where it has none.
     pub about: String,
+    /// Where it is written: `registry/masking/uniform.yaml (built in)`.
     pub place: String,
 }
 

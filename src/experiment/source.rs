@@ -8,7 +8,9 @@ use std::path::{Path, PathBuf};
 pub struct Span {
     /// Index of the layer.
     pub layer: u32,
+    /// The first byte.
     pub start: u32,
+    /// One past the last byte.
     pub end: u32,
 }
 
@@ -52,7 +54,9 @@ pub struct Source {
     pub name: String,
     /// Where it lies, for files; relative paths in it are relative to its folder.
     pub path: Option<PathBuf>,
+    /// All of it; what a [`Span`] of this layer counts bytes in.
     pub text: String,
+    /// How it takes part in the experiment.
     pub origin: Origin,
 }
 

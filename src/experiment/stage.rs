@@ -35,6 +35,7 @@ pub struct Port {
     pub name: &'static str,
     /// The artifact kinds it accepts.
     pub kinds: &'static [ArtifactKind],
+    /// How many stages may be connected to it.
     pub arity: Arity,
     /// One line for the schema and `reviv list`.
     pub about: &'static str,
@@ -45,7 +46,9 @@ pub struct Port {
 pub struct InputFacts<'a> {
     /// The stage at the other end.
     pub stage: &'a str,
+    /// The type of the artifact that arrives.
     pub kind: ArtifactKind,
+    /// What the artifact will be.
     pub description: &'a Description,
 }
 
@@ -80,6 +83,7 @@ impl<'a> Inputs<'a> {
 pub struct FileInput {
     /// The settings key that names it, for the diagnostic.
     pub key: String,
+    /// The file, or a folder of files; a relative path has been resolved.
     pub path: PathBuf,
 }
 
@@ -126,8 +130,11 @@ pub struct StagePlan {
 /// One modality's tokens in a plan.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct TokenPlan {
+    /// The modality that the tokens stand for.
     pub modality: String,
+    /// Tokens per clip.
     pub tokens: u64,
+    /// How many different tokens there are.
     pub vocabulary: u64,
     /// Mean number of tokens that masking shows to the encoder, by seeded simulation.
     pub mean_input: Option<f64>,
@@ -213,27 +220,39 @@ pub trait Op: Send + Sync + 'static {
 
 /// An [`Op`] with its settings type erased: what the graph holds. Implemented for every [`Op`].
 pub trait AnyOp: Send + Sync + 'static {
+    /// [`Op::name`]: what follows `op:`.
     fn name(&self) -> &'static str;
+    /// [`Op::version`]: part of the identity of what it makes.
     fn version(&self) -> u32;
+    /// [`Op::about`]: one line for `reviv list ops`.
     fn about(&self) -> &'static str;
+    /// [`Op::inputs`]: the edges it takes.
     fn inputs(&self) -> &'static [Port];
+    /// [`Op::output`]: what it makes.
     fn output(&self) -> ArtifactKind;
+    /// [`Op::seeded`]: whether what it makes depends on the seed.
     fn seeded(&self) -> bool;
     fn together(&self) -> bool;
     /// The schema of the settings, without `op` and the ports.
     fn schema(&self, generator: &mut SchemaGenerator) -> Schema;
     /// Settings with every default filled in.
     fn normalize(&self, settings: Value) -> Result<Value, serde_json::Error>;
+    /// [`Op::files`]; none where the settings do not fit.
     fn files(&self, settings: &Value) -> Vec<FileInput>;
+    /// [`Op::data`]: names of data sets, each with the settings key that asks for it; none where the settings do not fit.
     fn data(&self, settings: &Value) -> Vec<(String, String)>;
+    /// [`Op::optional_data`], as [`AnyOp::data`] gives it; none where the settings do not fit.
     fn optional_data(&self, settings: &Value) -> Vec<(String, String)>;
+    /// [`Op::check`]; `None`, and nothing reported, where the settings do not fit.
     fn check(
         &self,
         settings: &Value,
         inputs: &Inputs<'_>,
         problems: &mut Vec<Problem>,
     ) -> Option<Description>;
+    /// [`Op::plan`]; empty where the settings do not fit.
     fn plan(&self, settings: &Value, inputs: &Inputs<'_>, seed: u64) -> StagePlan;
+    /// [`Op::run`]; fails before any work where the settings do not fit.
     fn run(&self, settings: &Value, context: &mut dyn StageContext) -> Result<Value, StageError>;
 }
 

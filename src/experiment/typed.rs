@@ -38,9 +38,13 @@ impl Trace {
 
 /// Turns nodes into settings.
 pub struct Validator<'c, 'm> {
+    /// Schemas of all ops and kinds.
     pub catalog: &'c Catalog,
+    /// Where registry references are looked up.
     pub registry: &'m mut Registry,
+    /// The texts read so far; registry entries that are referred to are added.
     pub sources: &'m mut Sources,
+    /// Where everything that is wrong is reported.
     pub diagnostics: &'m mut Vec<Diagnostic>,
     /// Key path to where it was written.
     pub traces: BTreeMap<String, Trace>,

@@ -15,15 +15,20 @@ use std::fmt::Write as _;
 /// The history of one value, newest first.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Answer {
+    /// The full key: `stages.mget.steps`, `params.x`.
     pub key: String,
+    /// The value that holds, as text.
     pub value: String,
+    /// The first line of the setting's docs; empty for keys that are no setting.
     pub about: String,
+    /// Every layer that gave a value, the one that decided first; never empty.
     pub chain: Vec<Link>,
 }
 
 /// A layer that gave a value.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Link {
+    /// The value that it gave, as text.
     pub value: String,
     /// `experiments/tiny.yaml:11`.
     pub place: String,

@@ -18,7 +18,9 @@ pub const MAX_WEIGHT: usize = 200_000;
 /// A value and the place it was written at.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Node {
+    /// The value itself.
     pub data: Data,
+    /// Where it was written.
     pub span: Span,
     /// One of the three tags of the language.
     pub directive: Option<Directive>,
@@ -29,20 +31,30 @@ pub struct Node {
 /// What a node holds.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Data {
+    /// Nothing, `~` or `null`.
     Null,
+    /// `true` or `false`.
     Bool(bool),
+    /// A whole number: decimal, `0x` or `0o`.
     Int(i64),
+    /// Any other number, `.inf` and `.nan` included; also a whole number that an `i64` does not hold.
     Float(f64),
+    /// A string, quoted or plain.
     Text(String),
+    /// Elements in the order of the text.
     List(Vec<Node>),
+    /// Keys with their values, in the order of the text; no key comes twice.
     Map(Vec<Item>),
 }
 
 /// A key and its value, in the order of the text.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Item {
+    /// The key; one that is no string stands as its text.
     pub key: String,
+    /// Where the key was written.
     pub key_span: Span,
+    /// What the key stands for.
     pub value: Node,
 }
 

@@ -30,7 +30,9 @@ pub struct ImportOptions {
 /// What an import did.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ImportReport {
+    /// Where the model was written.
     pub folder: PathBuf,
+    /// One per converted model, in the order of writing.
     pub parts: Vec<PartReport>,
     /// Things a user should know: left-out modalities, missing statistics or tokenizers.
     pub notices: Vec<String>,
@@ -43,6 +45,7 @@ pub struct PartReport {
     pub name: String,
     /// Entries of its files, and how many of them were written.
     pub entries: usize,
+    /// Entries that were written; the others were shown to be redundant, never run, or of something unsupported.
     pub written: usize,
     /// Numbers written, statistics included.
     pub values: u64,

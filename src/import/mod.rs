@@ -30,13 +30,23 @@ use std::path::{Path, PathBuf};
 /// Why a file cannot be imported.
 #[derive(Debug, thiserror::Error)]
 pub enum ImportError {
+    /// The file is not what it seems, has an entry nobody knows, or would lose something; or the folder cannot be made.
     #[error("{}: {reason}", path.display())]
-    Refused { path: PathBuf, reason: String },
+    Refused {
+        /// The file or the folder.
+        path: PathBuf,
+        /// What is wrong, in words.
+        reason: String,
+    },
+    /// A container, an array or a pickle does not follow its format.
     #[error(transparent)]
     Format(#[from] crate::formats::FormatError),
+    /// A file or a folder cannot be read or written.
     #[error("{}: {source}", path.display())]
     Io {
+        /// The file or the folder.
         path: PathBuf,
+        /// What the file system said.
         #[source]
         source: std::io::Error,
     },

@@ -16,19 +16,38 @@ const MAX_TABLE: u64 = 1 << 24;
 #[derive(Debug, Clone, PartialEq)]
 pub enum Rule {
     /// Written as `name` with `shape` (as many values as the entry has).
-    Keep { name: String, shape: Vec<usize> },
+    Keep {
+        /// Its name in our file.
+        name: String,
+        /// Its shape in our file.
+        shape: Vec<usize>,
+    },
     /// A second name of `owner`; must hold the same values.
-    Alias { owner: String },
+    Alias {
+        /// Name of the entry that is kept instead.
+        owner: String,
+    },
     /// Must be zero everywhere.
     Zero,
     /// A fixed position table that this product computes itself; written all the same where `keep`.
-    Table { layout: Layout, keep: bool },
+    Table {
+        /// What the rows of the table stand for.
+        layout: Layout,
+        /// Whether it is written, under its own name.
+        keep: bool,
+    },
     /// Other constants that this product knows; must agree.
-    Constant { values: Vec<f32> },
+    Constant {
+        /// What it must hold, in order, as exactly as its element type allows.
+        values: Vec<f32>,
+    },
     /// A convolution that the forward pass of this model never runs.
     NeverRuns,
     /// Belongs to something that this product does not have.
-    Unsupported { why: &'static str },
+    Unsupported {
+        /// What it belongs to, in words, for the manifest.
+        why: &'static str,
+    },
 }
 
 /// How a position table enumerates its places.
@@ -49,6 +68,7 @@ pub struct Plan {
     pub part: String,
     /// `mget`, `vq` or `cosmos`.
     pub family: &'static str,
+    /// What happens to each entry of the checkpoint.
     pub rules: Vec<Rule>,
     /// What the tensors and arguments say about the model. Grids are filled in once position tables have been read.
     pub settings: Value,
@@ -70,6 +90,7 @@ impl Plan {
 /// What was found for one entry, for the manifest.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Verdict {
+    /// What became of the entry, in words: `kept as ...`, `left out: ...`.
     pub action: String,
     /// The grid a position table turned out to enumerate.
     pub grid: Option<Vec<usize>>,

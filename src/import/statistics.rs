@@ -15,7 +15,9 @@ const MAX_BYTES: u64 = 1 << 16;
 /// Mean and deviation of one modality, row-major over channels (camera) or joints and axes.
 #[derive(Debug, Clone, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct Statistics {
+    /// What is subtracted from the values before they are divided.
     pub mean: Vec<f32>,
+    /// What the centred values are divided by; as many numbers as [`Self::mean`].
     pub deviation: Vec<f32>,
     /// SHA-256 of the two files, where they came from files.
     pub sha256: Vec<String>,

@@ -132,41 +132,72 @@ impl TokenBudget {
 /// Why masking settings do not work with a set of modalities.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum MaskingError {
+    /// A budget, or the lower end of its range, is zero.
     #[error("`{setting}` is {tokens}: a sample needs at least one token on each side")]
     ZeroBudget {
+        /// `input_tokens` or `target_tokens`.
         setting: &'static str,
+        /// The budget, or the lower end of its range.
         tokens: usize,
     },
+    /// The lower end of a budget is above its upper end.
     #[error("`{setting}`: min {min} is above max {max}")]
     Range {
+        /// `input_tokens` or `target_tokens`.
         setting: &'static str,
+        /// The lower end.
         min: usize,
+        /// The upper end.
         max: usize,
     },
+    /// A concentration or a weight is negative, infinite or NaN.
     #[error(
         "`{setting}` holds {value}: a concentration or weight is a finite number, not negative"
     )]
-    Value { setting: String, value: f64 },
+    Value {
+        /// `alpha`, `weights`, or a modality's own: `input_alpha.body`.
+        setting: String,
+        /// The first such value.
+        value: f64,
+    },
+    /// `alpha` is an empty list.
     #[error("`alpha` has no component")]
     NoComponent,
+    /// The sum of `weights` is zero.
     #[error("`weights` are all zero: no component can be drawn")]
     NoWeight,
+    /// A list has not one value per component of `alpha`.
     #[error("`{setting}` has {found} values for {expected} mixture components")]
     Components {
+        /// `weights`, or a modality's own: `target_alpha.body`.
         setting: String,
+        /// Values in the list.
         found: usize,
+        /// Components of `alpha`.
         expected: usize,
     },
+    /// A setting names a modality that the model does not have.
     #[error("`{setting}` names `{name}`, which does not take part; taking part: {}", .known.join(", "))]
     UnknownModality {
+        /// `inputs`, `targets`, `input_alpha` or `target_alpha`.
         setting: &'static str,
+        /// The name, as written.
         name: String,
+        /// Names of the modalities that take part.
         known: Vec<String>,
     },
+    /// On one side, no modality has a concentration above 0 in any component.
     #[error("no modality can be {side}: every one is excluded or has concentration 0")]
-    NothingLeft { side: &'static str },
+    NothingLeft {
+        /// Which side, in words: `an input` or `a target`.
+        side: &'static str,
+    },
+    /// A modality of the model is empty.
     #[error("modality `{name}` has no tokens")]
-    NoTokens { name: String },
+    NoTokens {
+        /// Name of the modality.
+        name: String,
+    },
 }
 
 /// Settings resolved against the modalities of a model: per component and slot the concentration, 0 meaning never.

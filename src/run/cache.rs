@@ -26,7 +26,9 @@ pub const MANIFEST: &str = "manifest.json";
 /// What decided an artifact's bytes, for the reader of its manifest.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Recipe {
+    /// The op that made it.
     pub op: String,
+    /// The op's version when it made it; another version is another artifact.
     pub version: u32,
     /// `None` for ops without randomness, so that seeds share what they make.
     pub seed: Option<u64>,
@@ -100,7 +102,9 @@ impl<'de> Deserialize<'de> for Key {
 pub struct Manifest {
     /// The artifact's type: `clips`, `tokenizer`, ...
     pub kind: String,
+    /// The artifact's own address, by which a manifest in the wrong place is noticed.
     pub key: Key,
+    /// What decided its bytes.
     pub recipe: Recipe,
     /// What the op says of it.
     pub contents: Value,
@@ -111,16 +115,20 @@ pub struct Manifest {
 /// One file of an artifact.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct FileHash {
+    /// The file's size.
     pub bytes: u64,
+    /// The hash of its content, in hexadecimal.
     pub blake3: String,
 }
 
 /// How an artifact came to be; kept beside it, not in it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Made {
+    /// The op that made it.
     pub op: String,
     /// Of work, over all attempts.
     pub seconds: f64,
+    /// Name of the machine that made it.
     pub host: String,
     /// UTC.
     pub at: String,
@@ -131,6 +139,7 @@ pub struct Made {
 /// What a look at a key finds.
 #[derive(Debug)]
 pub enum Entry {
+    /// There is nothing.
     Absent,
     /// The artifact, with its manifest and every file at its size.
     Whole(Box<Manifest>),
@@ -155,6 +164,7 @@ impl Cache {
         Self::new(runs.join("cache"))
     }
 
+    /// The cache in a directory, which is made when something is put there.
     pub fn new(root: impl Into<PathBuf>) -> Self {
         Self {
             root: root.into(),
@@ -171,6 +181,7 @@ impl Cache {
         }
     }
 
+    /// The directory that holds all of it.
     pub fn root(&self) -> &Path {
         &self.root
     }
@@ -188,6 +199,7 @@ impl Cache {
             .join(format!("{name}.{extension}"))
     }
 
+    /// The lock file of `key`, beside its artifact: who makes the artifact holds it.
     pub fn lock_path(&self, key: &Key) -> PathBuf {
         self.beside(key, "lock")
     }
@@ -421,8 +433,11 @@ impl Cache {
 /// `damaged`).
 #[derive(Debug)]
 pub struct Leaf {
+    /// The artifact that it is, or lies beside.
     pub key: Key,
+    /// What follows the first dot of its name: empty, `lock`, `making`, `made.json`, `damaged`.
     pub extension: String,
+    /// Where it lies.
     pub path: PathBuf,
 }
 

@@ -9,25 +9,34 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 /// What a run was made with, as `lock.json` keeps it.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Environment {
+    /// Version of this program.
     pub reviv: String,
     /// blake3 of the running binary.
     pub binary: Option<String>,
+    /// The machine's name.
     pub host: String,
+    /// Operating system and processor family: `linux x86_64`.
     pub system: String,
+    /// Model name of the processor; `unknown` where the machine does not say.
     pub cpu: String,
+    /// Threads that this process can run at once.
     pub cores: usize,
+    /// Main memory of the machine; `None` where it does not say.
     pub memory_bytes: Option<u64>,
     /// The repository that holds the experiment, if there is one.
     pub git: Option<Git>,
     /// How random numbers are made; another scheme gives other numbers from the same seed.
     pub random: String,
+    /// The command line, the program itself first.
     pub argv: Vec<String>,
 }
 
 /// The state of a git work tree.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Git {
+    /// Hash of the commit that is checked out.
     pub revision: String,
+    /// Whether tracked files differ from that commit; untracked files do not count.
     pub dirty: bool,
     /// `git diff HEAD`; the run directory keeps it as `source/dirty.patch`.
     #[serde(skip)]
@@ -133,11 +142,17 @@ pub fn now_text() -> String {
 /// A moment in UTC, taken apart.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Utc {
+    /// Of the proleptic Gregorian calendar.
     pub year: i64,
+    /// 1 to 12.
     pub month: u32,
+    /// 1 to 31.
     pub day: u32,
+    /// 0 to 23.
     pub hour: u32,
+    /// 0 to 59.
     pub minute: u32,
+    /// 0 to 59: there are no leap seconds.
     pub second: u32,
 }
 
@@ -190,14 +205,17 @@ impl Utc {
 pub struct Stopwatch(Instant);
 
 impl Stopwatch {
+    /// Begins to measure.
     pub fn start() -> Self {
         Self(Instant::now())
     }
 
+    /// Time since the start; setting the machine's clock does not change it.
     pub fn elapsed(self) -> Duration {
         self.0.elapsed()
     }
 
+    /// Seconds since the start.
     pub fn seconds(self) -> f64 {
         self.elapsed().as_secs_f64()
     }

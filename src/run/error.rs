@@ -6,7 +6,9 @@ use std::path::{Path, PathBuf};
 /// Who has a lock, as its file says.
 #[derive(Debug, Clone, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 pub struct Holder {
+    /// Name of the machine that its process runs on.
     pub host: String,
+    /// Its process on that machine.
     pub pid: u32,
     /// UTC, ISO 8601.
     pub since: String,
@@ -15,8 +17,11 @@ pub struct Holder {
 /// Why something failed, as the record keeps it.
 #[derive(Debug, Clone, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 pub struct Failure {
+    /// As [`RunError::code`] gives it: `E0502`.
     pub code: String,
+    /// What went wrong, in words.
     pub message: String,
+    /// The stage whose op failed; `None` for every other failure.
     pub stage: Option<String>,
 }
 
@@ -25,44 +30,79 @@ pub struct Failure {
 pub enum RunError {
     /// The device of `path` is full, or a quota is used up.
     #[error("no space left while {action} `{path}`")]
-    NoSpace { action: &'static str, path: PathBuf },
+    NoSpace {
+        /// What was being done: `reading`, `writing`, ...
+        action: &'static str,
+        /// The file or directory that it was done to.
+        path: PathBuf,
+    },
     /// `path` cannot be written.
     #[error("`{path}` cannot be written: {reason}")]
-    ReadOnly { path: PathBuf, reason: io::Error },
+    ReadOnly {
+        /// The file or directory.
+        path: PathBuf,
+        /// What the file system said.
+        reason: io::Error,
+    },
     /// Any other failure of the file system.
     #[error("{action} `{path}` failed: {reason}")]
     Io {
+        /// What was being done: `reading`, `writing`, ...
         action: &'static str,
+        /// The file or directory that it was done to.
         path: PathBuf,
+        /// What the file system said.
         reason: io::Error,
     },
     /// A live process owns what is asked for.
     #[error("`{path}` is in use by another process{}", holder_text(.holder.as_ref()))]
     Held {
+        /// The lock file, or the directory of the run that is asked for.
         path: PathBuf,
+        /// Who owns it, where its lock says so.
         holder: Option<Holder>,
     },
     /// A file of the record does not say what it must.
     #[error("`{path}` is not what this version writes: {reason}")]
-    Malformed { path: PathBuf, reason: String },
+    Malformed {
+        /// The file or directory.
+        path: PathBuf,
+        /// What does not fit, in words.
+        reason: String,
+    },
     /// What was hashed once has other bytes now.
     #[error("{what} has changed: {detail}")]
-    Changed { what: String, detail: String },
+    Changed {
+        /// What was hashed, in words: a file, an artifact, a stage.
+        what: String,
+        /// How it is not as it was.
+        detail: String,
+    },
     /// Somebody asked to stop, and the stage did.
     #[error("interrupted")]
     Interrupted,
     /// A stage's own failure, in its op's words.
     #[error("stage `{stage}`: {message}")]
     Stage {
+        /// The stage's name in the experiment.
         stage: String,
+        /// The code that the op chose; `E0806` for a failure without one and for a bug.
         code: String,
+        /// What went wrong, in the op's words.
         message: String,
+        /// The way out; empty for none.
         help: String,
+        /// Exit code of the process: 1 for what the user can mend, 2 for anything else.
         exit: u8,
     },
     /// The request names something that is not there, or makes no sense.
     #[error("{message}")]
-    Request { message: String, help: String },
+    Request {
+        /// What is not there or makes no sense.
+        message: String,
+        /// The way out.
+        help: String,
+    },
 }
 
 fn holder_text(holder: Option<&Holder>) -> String {
@@ -174,6 +214,7 @@ impl From<RunError> for crate::experiment::StageError {
 
 /// Adds what was done to which file to an I/O error.
 pub trait AtPath<T> {
+    /// `action` is what was being done to `path`: `reading`, `writing`, ...
     fn at(self, action: &'static str, path: &Path) -> Result<T, RunError>;
 }
 

@@ -20,7 +20,9 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 /// What became of it.
 #[derive(Debug)]
 pub struct Outcome {
+    /// The record of the run.
     pub run: RunDirectory,
+    /// How the part of this process ended.
     pub state: State,
     /// Pieces of work done by this process.
     pub made: usize,

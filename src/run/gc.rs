@@ -29,8 +29,10 @@ pub(super) fn keep_away(
 /// What was pruned, or would be.
 #[derive(Debug, Default, Serialize)]
 pub struct Pruned {
+    /// Files and directories that were removed, or would be.
     #[serde(serialize_with = "crate::formats::text::serialize_paths")]
     pub paths: Vec<PathBuf>,
+    /// Their size in bytes, all together.
     pub bytes: u64,
     /// Artifacts that runs refer to.
     pub kept: usize,

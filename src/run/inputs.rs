@@ -19,7 +19,9 @@ use std::path::{Path, PathBuf};
 /// A fingerprint, and how many bytes stand behind it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Fingerprint {
+    /// blake3 of a file's bytes; of a folder, of the names and hashes of its files.
     pub hash: blake3::Hash,
+    /// Size of the file, or of all files of the folder together.
     pub bytes: u64,
 }
 

@@ -14,6 +14,7 @@ impl Interrupt {
         self.0.store(true, Ordering::SeqCst);
     }
 
+    /// Whether somebody has asked to stop.
     pub fn requested(&self) -> bool {
         self.0.load(Ordering::Relaxed)
     }

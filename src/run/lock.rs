@@ -19,7 +19,9 @@ pub struct Lock {
 /// Alone, or together with others that also share.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Mode {
+    /// Alone; the lock's file says who has it.
     Exclusive,
+    /// Together with others that share; the lock's file is left as it is.
     Shared,
 }
 

@@ -255,8 +255,11 @@ fn cut_where(path: &Path, cut: impl Fn(u64) -> bool) -> Result<Option<u64>, RunE
 /// One line of `metrics.jsonl`, read back.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Row {
+    /// The step that was recorded, as the op counts.
     pub step: u64,
+    /// When it was recorded, in seconds since 1970; 0 where the line does not say.
     pub time: f64,
+    /// Name and value, in the order of the line; NaN and infinities are read back.
     pub scalars: Vec<(String, f64)>,
 }
 

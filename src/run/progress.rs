@@ -39,6 +39,7 @@ impl Progress {
         }
     }
 
+    /// Shows nothing.
     pub fn silent() -> Self {
         Self { show: Show::Silent }
     }

@@ -17,6 +17,7 @@ use std::path::Path;
 pub struct LockFile {
     /// When a process last began to work on the run, UTC.
     pub at: String,
+    /// The machine, the binary, the command line and the state of git at that time.
     pub environment: Environment,
     /// Outside files and data sets that stages read, by path.
     pub files: Vec<FilePlan>,

@@ -28,7 +28,9 @@ use std::path::{Path, PathBuf};
 pub enum State {
     /// There is work left, and nobody is on it.
     Queued,
+    /// A process works on it.
     Running,
+    /// Everything that was asked for is there.
     Done,
     /// It ended with an error; asking again tries again.
     Failed,
@@ -53,6 +55,7 @@ impl fmt::Display for State {
 pub struct Shard {
     /// From 1.
     pub index: u32,
+    /// How many parts there are.
     pub count: u32,
 }
 
@@ -82,9 +85,11 @@ impl std::str::FromStr for Shard {
 /// `run.json`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Run {
+    /// The name of the experiment or sweep.
     pub name: String,
     /// The hash of everything that was asked for.
     pub identity: Key,
+    /// Where all parts together stand.
     pub state: State,
     /// The file that was asked for, as given.
     pub experiment: String,
@@ -97,12 +102,17 @@ pub struct Run {
 /// One process's share of a run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Part {
+    /// Where this share stands.
     pub state: State,
+    /// Name of the machine that works or worked on it.
     pub host: String,
+    /// The process on that machine.
     pub pid: u32,
     /// UTC.
     pub started: String,
+    /// UTC; `None` while it runs, and where the process was killed.
     pub ended: Option<String>,
+    /// The first failure, if there was one.
     pub error: Option<Failure>,
 }
 
@@ -111,10 +121,15 @@ pub struct Part {
 pub struct IndexLine {
     /// UTC.
     pub time: String,
+    /// The name of the run's directory.
     pub run: String,
+    /// Where the run stands from then on.
     pub state: State,
+    /// The part whose process wrote the line: `2/4`.
     pub shard: String,
+    /// Name of the machine that wrote the line.
     pub host: String,
+    /// The process that wrote the line.
     pub pid: u32,
 }
 
@@ -244,6 +259,7 @@ impl RunDirectory {
             .find(|run| run.read().is_ok_and(|read| read.identity == *identity)))
     }
 
+    /// Where the directory lies.
     pub fn path(&self) -> &Path {
         &self.path
     }
@@ -263,6 +279,7 @@ impl RunDirectory {
         }
     }
 
+    /// The HTML page about the run.
     pub fn report(&self) -> PathBuf {
         self.path.join("report").join("index.html")
     }
@@ -368,6 +385,7 @@ impl Owned {
     /// Space that is given back when the disk is full, so that the end of the run can still be written.
     const RESERVE: usize = 64 << 10;
 
+    /// The run's directory.
     pub fn directory(&self) -> &RunDirectory {
         &self.directory
     }

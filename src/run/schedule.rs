@@ -16,10 +16,15 @@ use std::path::{Path, PathBuf};
 /// All work of a run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Schedule {
+    /// The name of the experiment or sweep.
     pub name: String,
+    /// What it is for, from `about:`; empty where the file does not say.
     pub about: String,
+    /// The hash of the name, the cells, their stages and all keys: what is asked for again has the same.
     pub identity: Key,
+    /// Whether the file is a sweep, even of one cell.
     pub sweep: bool,
+    /// One per arm, grid point and seed, in the order of the file.
     pub cells: Vec<CellPlan>,
     /// Inputs come before what reads them.
     pub works: Vec<Task>,
@@ -30,8 +35,11 @@ pub struct Schedule {
 /// One arm with one seed, and what its stages are.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct CellPlan {
+    /// A name for people: `full-s0`.
     pub label: String,
+    /// Name of the arm and its grid point; empty for a plain experiment.
     pub arm: String,
+    /// Seed of the cell.
     pub seed: u64,
     /// Stage name to key, in topological order.
     pub stages: Vec<(String, Key)>,
@@ -42,6 +50,7 @@ pub struct CellPlan {
 /// One piece of work.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Task {
+    /// Address of the artifact that it makes.
     pub key: Key,
     /// The stage's name where it appears first.
     pub stage: String,
@@ -49,14 +58,21 @@ pub struct Task {
     pub directory: String,
     /// Labels of the cells that share it.
     pub cells: Vec<String>,
+    /// The op that does it.
     pub op: String,
+    /// The op's version when the run was planned.
     pub version: u32,
     /// The artifact's type.
     pub kind: String,
+    /// Seed of the stage; without effect where [`Task::seeded`] is false.
     pub seed: u64,
+    /// Whether the artifact depends on the seed.
     pub seeded: bool,
+    /// Resolved: no reference, no default left open.
     pub settings: Value,
+    /// What it reads from other stages, in the order of the op's ports.
     pub inputs: Vec<PortPlan>,
+    /// Outside files and data sets that it reads.
     pub files: Vec<FilePlan>,
     /// Names of the data sets it reads.
     pub data: Vec<String>,
@@ -67,6 +83,7 @@ pub struct Task {
 /// What arrives at one port.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PortPlan {
+    /// The op's key for this input.
     pub port: String,
     /// Stage name and key, in the order of the YAML.
     pub from: Vec<(String, Key)>,
@@ -77,9 +94,12 @@ pub struct PortPlan {
 pub struct FilePlan {
     /// The settings key that names it; `data:NAME` for a data set.
     pub key: String,
+    /// Where it lies on the machine that planned the run.
     #[serde(serialize_with = "crate::formats::text::serialize_path")]
     pub path: PathBuf,
+    /// Its fingerprint in hexadecimal.
     pub blake3: String,
+    /// Size of the file, or of all files of the data set together.
     pub bytes: u64,
 }
 
@@ -148,6 +168,7 @@ impl Schedule {
         })
     }
 
+    /// The work that makes the artifact of `key`.
     pub fn work(&self, key: &Key) -> Option<&Task> {
         self.works.iter().find(|work| work.key == *key)
     }
@@ -214,6 +235,7 @@ impl Schedule {
 }
 
 impl Task {
+    /// Keys of all artifacts that it reads, port by port.
     pub fn input_keys(&self) -> impl Iterator<Item = Key> + '_ {
         self.inputs
             .iter()

@@ -24,9 +24,13 @@ use std::path::{Path, PathBuf};
 /// `stage.json`: where one stage of a run stands.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct StageRecord {
+    /// The stage's name where it appears first.
     pub stage: String,
+    /// The op that does it.
     pub op: String,
+    /// Address of its artifact.
     pub key: Key,
+    /// Where the stage stands.
     pub state: State,
     /// The artifact, relative to the directory of runs.
     pub artifact: String,
@@ -36,9 +40,11 @@ pub struct StageRecord {
     pub seconds: f64,
     /// UTC.
     pub started: Option<String>,
+    /// UTC; `None` while it runs, where it was killed, or where it was found in the cache at once.
     pub ended: Option<String>,
     /// For a stage that was found in the cache: where it was made.
     pub found: Option<Made>,
+    /// Why it failed; `None` in every other state.
     pub error: Option<Failure>,
 }
 
@@ -97,9 +103,13 @@ pub fn note_cached(work: &Task, directory: &Path, cache: &Cache) -> Result<(), R
 /// What a stage needs beside its own work.
 #[derive(Debug)]
 pub struct Surroundings<'a> {
+    /// Where its inputs come from, and where the artifact goes.
     pub cache: &'a Cache,
+    /// Where data sets lie: name to directory.
     pub data: &'a BTreeMap<String, PathBuf>,
+    /// Where to say how far it is.
     pub progress: &'a Progress,
+    /// Who may stop it.
     pub interrupt: &'a Interrupt,
     /// Other processes, for the stages that all do together.
     pub peers: Option<&'a dyn Peers>,

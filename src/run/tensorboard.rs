@@ -17,8 +17,11 @@ pub struct EventWriter<W: Write> {
 /// How a session of hyperparameters ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum SessionStatus {
+    /// The stage finished.
     Success = 1,
+    /// The stage failed.
     Failure = 2,
+    /// The stage was interrupted, and may go on.
     Running = 3,
 }
 
@@ -124,6 +127,7 @@ impl<W: Write> EventWriter<W> {
         self.hparams_value(time, "_hparams_/session_end_info", 4, &end)
     }
 
+    /// Flushes what the events are written to.
     pub fn flush(&mut self) -> io::Result<()> {
         self.out.flush()
     }

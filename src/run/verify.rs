@@ -20,16 +20,21 @@ use std::path::Path;
 /// One thing that was looked at.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Check {
+    /// What was looked at: an input or a stage; `, again` where the stage was done again.
     pub what: String,
+    /// What the look says of it.
     pub verdict: Verdict,
     /// What was found.
     pub detail: String,
 }
 
+/// What a look says.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Verdict {
+    /// The bytes are those of the record.
     Same,
+    /// The bytes are others, or cannot be had.
     Changed,
     /// Not looked at, and why.
     Skipped,

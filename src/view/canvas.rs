@@ -17,6 +17,7 @@ pub struct Canvas {
 
 /// Pixels between the starts of two letters, and from a line of words to the next.
 pub const LETTER: usize = 8;
+/// Pixels from the top of one line of words to the top of the next.
 pub const LINE: usize = 14;
 
 /// Five rows of three bits per character, from the top, one octal digit each.

@@ -14,6 +14,7 @@ const MARGIN: usize = 12;
 /// A frame and its depth, both small.
 #[derive(Debug, Clone)]
 pub struct DepthTile {
+    /// Number of the frame, printed above the tile.
     pub frame: usize,
     width: usize,
     rgb: Vec<u8>,

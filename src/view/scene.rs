@@ -7,6 +7,7 @@ use ndarray::{Array2, Array3, ArrayView3};
 /// Everything on one timeline.
 #[derive(Debug, Clone)]
 pub struct Scene {
+    /// The page's heading.
     pub title: String,
     /// Short statements beside the title: scale status, synthetic or real.
     pub badges: Vec<Badge>,
@@ -18,7 +19,9 @@ pub struct Scene {
     pub samples: usize,
     /// The camera's projection, in pixels of the video.
     pub intrinsics: Intrinsics,
+    /// `None` for a page without images.
     pub video: Option<VideoFrames>,
+    /// `None` where there is no depth.
     pub depth: Option<DepthGrids>,
     /// Points of the whole recording, world.
     pub cloud: Vec<Point>,
@@ -26,28 +29,36 @@ pub struct Scene {
     pub floor: Option<f64>,
     /// The prediction first; the truth, where it is known, beside it.
     pub tracks: Vec<Track>,
+    /// One per modality for which it is known.
     pub confidence: Vec<Confidence>,
 }
 
 /// How a badge is meant; the words say it too.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Tone {
+    /// A fact, neither good nor bad.
     Plain,
+    /// A reason for trust: a metric scale.
     Good,
+    /// A reason for care: a scale that is not known.
     Warn,
 }
 
 /// A short statement beside the title.
 #[derive(Debug, Clone)]
 pub struct Badge {
+    /// As shown.
     pub text: String,
+    /// How it is meant.
     pub tone: Tone,
 }
 
 /// A label and its value.
 #[derive(Debug, Clone)]
 pub struct Fact {
+    /// What the value is of.
     pub label: String,
+    /// As shown, with its unit.
     pub value: String,
 }
 
@@ -143,9 +154,11 @@ pub struct Track {
 /// One modality of one version of the wearer.
 #[derive(Debug, Clone)]
 pub struct Part {
+    /// Name of the modality.
     pub modality: String,
     /// What is shown and hidden together: `body`, `hands`, `gaze`, `camera`, or a name of its own.
     pub layer: String,
+    /// What a row of the values holds, and how it is drawn.
     pub drawing: Drawing,
     /// One row per sample of the timeline, NaN where unknown; what a row holds, the drawing says.
     pub values: Array2<f32>,
@@ -174,13 +187,16 @@ pub enum Drawing {
     ImagePoint,
     /// Joints in the world, 3 numbers each. Bones are pairs of joints and a radius in metres.
     Joints {
+        /// Indices of two joints, and the radius of the bone between them in metres.
         bones: Vec<(usize, usize, f32)>,
         /// Drawn into the image too.
         in_image: bool,
     },
     /// Channels over time, one number each. Curves beside the video.
     Plot {
+        /// One name per number of a row; empty where they have none.
         channels: Vec<String>,
+        /// One unit per channel, or one for all.
         units: Vec<String>,
     },
 }
@@ -197,20 +213,30 @@ pub struct Confidence {
 /// Why a scene cannot be shown.
 #[derive(Debug, thiserror::Error)]
 pub enum ViewError {
+    /// A part has not one row per sample, its rows not the numbers its drawing needs, or depth not one grid per frame.
     #[error("{what} has {found} entries, the timeline has {expected}")]
     Length {
+        /// What does not fit, in words: `prediction left hand`, `prediction gaze values`, `depth`.
         what: String,
+        /// Rows, numbers per row or grids that it has.
         found: usize,
+        /// As many as it must have.
         expected: usize,
     },
+    /// There is no sample, or the rate is not a positive number.
     #[error("a scene needs at least one sample and a positive rate")]
     Empty,
+    /// A video frame has no pixel, not three channels, or a side beyond what JPEG can store.
     #[error("video frames of {width}x{height} cannot be stored as JPEG: {reason}")]
     Jpeg {
+        /// Pixels across.
         width: usize,
+        /// Pixels down.
         height: usize,
+        /// What is wrong with it, in words.
         reason: String,
     },
+    /// The page cannot be written to the disk.
     #[error("writing the page: {0}")]
     Write(#[from] std::io::Error),
 }

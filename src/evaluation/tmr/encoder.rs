@@ -22,8 +22,11 @@ pub const LONGEST: usize = 4998;
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct MotionEncoderSettings {
+    /// Width of the tokens and of the embedding: even, and a multiple of `heads`.
     pub width: usize,
+    /// Number of transformer layers.
     pub layers: usize,
+    /// Attention heads of every layer.
     pub heads: usize,
     /// Width inside the feed-forward layers.
     pub hidden: usize,
@@ -142,6 +145,7 @@ impl Layer {
 pub struct Embedded {
     /// The embedding: the mean, nothing sampled.
     pub mu: Vec<f32>,
+    /// Logarithm of the variance, one number per number of [`Self::mu`].
     pub logvar: Vec<f32>,
 }
 
@@ -150,7 +154,9 @@ pub struct Embedded {
 pub struct Stages {
     /// Without the tokens.
     pub projected: Tensor<2>,
+    /// Tokens and frames with their positions added: what the first layer reads.
     pub with_positions: Tensor<2>,
+    /// What each layer gives, in order.
     pub layers: Vec<Tensor<2>>,
 }
 
@@ -173,6 +179,7 @@ impl MotionEncoder {
         })
     }
 
+    /// The sizes it was made with.
     #[must_use]
     pub fn settings(&self) -> &MotionEncoderSettings {
         &self.settings

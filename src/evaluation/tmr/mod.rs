@@ -39,6 +39,7 @@ pub enum FeatureRate {
 /// An encoder with the statistics its inputs are normalised by.
 #[derive(Debug, Clone)]
 pub struct Tmr {
+    /// The transformer; it takes features that [`Tmr::normalise`] has normalised.
     pub encoder: MotionEncoder,
     /// Of every feature.
     mean: Vec<f32>,
@@ -85,6 +86,7 @@ impl Tmr {
         &self.fingerprint
     }
 
+    /// Mean and standard deviation of every feature, [`FEATURES`] numbers each.
     #[must_use]
     pub fn statistics(&self) -> [&[f32]; 2] {
         [&self.mean, &self.deviation]

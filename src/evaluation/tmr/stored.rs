@@ -13,6 +13,7 @@ pub const FORMAT: &str = "reviv motion encoder 1";
 pub const FILE: &str = "weights.safetensors";
 /// The statistics' names in it.
 pub const MEAN: &str = "statistics.mean";
+/// Name of the tensor with the features' standard deviations.
 pub const DEVIATION: &str = "statistics.std";
 
 /// The metadata of a file of such an encoder.

@@ -25,8 +25,11 @@ use std::path::{Path, PathBuf};
 /// The container a checkpoint lies in.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Format {
+    /// Pickles of torch: a zip archive, or one stream as torch wrote it before 1.6.
     Torch,
+    /// A zip archive of code and a tree of objects.
     TorchScript,
+    /// A JSON header, then the values.
     Safetensors,
 }
 
@@ -36,17 +39,21 @@ pub const BARE: &str = "tensor";
 /// One named tensor.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Entry {
+    /// Its name in the file, without the [`Checkpoint::wrappers`].
     pub name: String,
+    /// Where its values lie, and of which type they are.
     pub view: TensorView,
     /// The first entry that is the same view of the same memory.
     pub same_as: Option<usize>,
 }
 
 impl Entry {
+    /// Length of every axis; empty for a single number.
     pub fn shape(&self) -> Vec<usize> {
         self.view.shape.iter().map(|&d| d as usize).collect()
     }
 
+    /// Element type of its values.
     pub fn scalar(&self) -> Scalar {
         self.view.storage.scalar
     }
@@ -123,10 +130,12 @@ impl Checkpoint {
         }
     }
 
+    /// The file, as it was given to [`Checkpoint::open`].
     pub fn path(&self) -> &Path {
         &self.path
     }
 
+    /// The container that the file turned out to be.
     pub fn format(&self) -> Format {
         self.format
     }
