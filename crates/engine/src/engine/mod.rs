@@ -38,9 +38,7 @@ pub use weights::{HostTensor, Values, Weights};
 pub enum EngineError {
     #[error("there is no device `{device}`: {hint}")]
     NoSuchDevice { device: String, hint: &'static str },
-    #[error(
-        "precision `{precision}` is not available on `{device}`: no operation computes in it yet; use `f32`"
-    )]
+    #[error("the device `{device}` does not compute in `{precision}`; use `precision: f32`")]
     Precision {
         precision: &'static str,
         device: String,
