@@ -31,6 +31,10 @@ bench *NAME:
 speed *ARGUMENTS:
     cargo bench --bench speed -- {{ ARGUMENTS }}
 
+# A page about this machine's GPU: `just gpu --features cuda --device cuda`.
+gpu *ARGUMENTS:
+    examples/gpu_report.sh {{ ARGUMENTS }}
+
 # Products of every model's shapes: `just products --blas /path/to/libmkl_rt.so`.
 products *ARGUMENTS:
     cargo bench --bench products -- {{ ARGUMENTS }}

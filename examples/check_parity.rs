@@ -1,4 +1,4 @@
-//! Compares this implementation with numbers of the reference: `cargo run --example check_parity -- DIR`.
+//! Compares this implementation with numbers of the reference: `cargo run --example check_parity -- DIR [--device cuda]`.
 //!
 //! `DIR` holds a set of vectors (`vq/`, `optim/`, ...), or is one of those folders. Settings, sizes and tolerances are read
 //! from the files. Prints one line per tensor, the worst last, and exits 1 if any is off.
@@ -6,14 +6,33 @@
 #[path = "check_parity/mod.rs"]
 mod check_parity;
 
+use clap::Parser;
+use reviv::engine::{Compute, DeviceChoice, Precision};
+use std::path::PathBuf;
 use std::process::ExitCode;
 
+/// Compares this implementation with numbers of the reference.
+#[derive(Debug, Parser)]
+struct Arguments {
+    /// A set of vectors (`vq/`, `optim/`, ...), or one of those folders.
+    #[arg(value_name = "DIR")]
+    folder: PathBuf,
+    /// What computes: auto, cpu, cuda, vulkan, metal or wgpu, a GPU also with its number: `cuda:1`.
+    #[arg(long, value_name = "DEVICE", default_value = "cpu")]
+    device: DeviceChoice,
+}
+
 fn main() -> ExitCode {
-    let Some(folder) = std::env::args_os().nth(1) else {
-        eprintln!("usage: check_parity DIR");
-        return ExitCode::from(2);
+    let arguments = Arguments::parse();
+    let compute = match Compute::new(arguments.device, Precision::F32) {
+        Ok(compute) => compute,
+        Err(error) => {
+            eprintln!("error: {error}");
+            return ExitCode::from(2);
+        }
     };
-    match check_parity::check(folder.as_ref()) {
+    println!("on {}", compute.name());
+    match check_parity::check(&arguments.folder, &compute) {
         Ok(report) => {
             print!("{report}");
             ExitCode::from(u8::from(!report.passed()))

@@ -2,7 +2,7 @@
 
 use crate::measure::Meter;
 use burn::tensor::{Tensor, TensorData};
-use reviv::engine::{Compute, Initialise};
+use reviv::engine::Initialise;
 use reviv::labelling::{DepthNetwork, FrameFeatures, NetworkSettings};
 
 /// Patches along a side.
@@ -11,7 +11,7 @@ const CELLS: usize = 37;
 const TOGETHER: usize = 4;
 
 pub fn run(meter: &Meter, frames: usize) {
-    let compute = Compute::cpu();
+    let compute = crate::compute();
     let network = DepthNetwork::new(&Initialise::new(&compute, 0), &NetworkSettings::small())
         .expect("the sizes of Small fit each other");
     let positions = network.encoder().positions([CELLS; 2]);

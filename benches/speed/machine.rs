@@ -46,11 +46,12 @@ pub fn header(threads: usize, rounds: usize, all: &[Results], compared: bool) ->
     format!(
         "# Speed\n\n\
          {}, {threads} of {} cores used{memory}; {system}. {with}. {}.\n\n\
-         Seconds are the median and (least..most) of {rounds}, in f32 on the CPU, each in a fresh process after one \
+         Seconds are the median and (least..most) of {rounds}, in f32 on {}, each in a fresh process after one \
          call to warm up.{ratio} Memory is the peak of the process; page faults are the most of any call after the second.\n",
         environment.cpu,
         environment.cores,
         now_text(),
+        crate::compute().name(),
     )
 }
 

@@ -1,6 +1,6 @@
 //! How fast reviv is, beside PyTorch on the same machine in the same run.
 //!
-//! `cargo bench --bench speed -- --python PATH [--threads N] [--rounds N] [--write FILE] [CASE...]`
+//! `cargo bench --bench speed -- --python PATH [--device cuda] [--threads N] [--rounds N] [--write FILE] [CASE...]`
 //!
 //! PATH is a Python that has PyTorch; without it reviv is measured alone. The two sides take turns, round by round, each in a
 //! process of its own with as many threads and one call to warm up, so both see the same machine and neither the other's
@@ -20,14 +20,23 @@ mod video;
 use clap::{Parser, ValueEnum};
 use measure::Meter;
 use peer::{Answers, Question, Side};
+use reviv::engine::{Compute, DeviceChoice, Precision};
 use std::num::NonZeroUsize;
 use std::path::PathBuf;
 use std::process::ExitCode;
+use std::sync::OnceLock;
 use table::Results;
 
 /// As in the program.
 #[global_allocator]
 static MEMORY: reviv::engine::memory::Pool = reviv::engine::memory::Pool;
+
+/// What our side computes on.
+static DEVICE: OnceLock<Compute> = OnceLock::new();
+
+fn compute() -> Compute {
+    DEVICE.get().cloned().unwrap_or_else(Compute::cpu)
+}
 
 /// Measures reviv, and PyTorch beside it.
 #[derive(Debug, Parser)]
@@ -42,6 +51,9 @@ struct Arguments {
     /// Threads of each side; as many as there are cores if not given.
     #[arg(long, value_name = "N")]
     threads: Option<NonZeroUsize>,
+    /// Where reviv computes: auto, cpu, cuda, vulkan, metal or wgpu, a GPU also with its number: `cuda:1`.
+    #[arg(long, value_name = "DEVICE", default_value = "cpu")]
+    device: DeviceChoice,
     /// How often each side has its turn.
     #[arg(long, value_name = "N", default_value = "3")]
     rounds: NonZeroUsize,
@@ -144,6 +156,15 @@ fn main() -> ExitCode {
         || std::thread::available_parallelism().map_or(1, usize::from),
         usize::from,
     );
+    match Compute::new(arguments.device, Precision::F32) {
+        Ok(compute) => {
+            let _ = DEVICE.set(compute);
+        }
+        Err(error) => {
+            eprintln!("error: {error}");
+            return ExitCode::FAILURE;
+        }
+    }
     if let (Some(repeats), [case]) = (arguments.repeats, arguments.cases.as_slice()) {
         alone(*case, repeats, threads);
         return ExitCode::SUCCESS;
@@ -192,6 +213,7 @@ fn compare(arguments: &Arguments, threads: usize) -> String {
             case: case.name(),
             repeats: case.repeats(),
             threads,
+            device: arguments.device,
         };
         for round in 1..=rounds {
             eprintln!("{}, round {round} of {rounds}", question.case);

@@ -31,7 +31,7 @@ impl Meter {
         say(&Line::Measured(Measured {
             name: name.to_owned(),
             seconds,
-            memory_mib: peak(),
+            memory_mib: device_memory().or_else(peak),
             // The call to warm up is the first.
             faults: faulted.into_iter().skip(1).flatten().max(),
         }));
@@ -54,6 +54,12 @@ fn say(line: &Line) {
 /// Lets the peak begin at what is in use now, where the system can; elsewhere it is that of all work so far.
 fn reset_peak() {
     let _ = std::fs::write("/proc/self/clear_refs", "5");
+}
+
+/// What a GPU holds for this process in MiB, which never shrinks meanwhile; `None` for the processor.
+fn device_memory() -> Option<f64> {
+    let bytes = crate::compute().memory()?;
+    Some(bytes as f64 / f64::from(1 << 20))
 }
 
 /// Peak of resident memory in MiB; `None` where the system does not tell.

@@ -1,7 +1,7 @@
 //! One forward pass and one training step of MGET, and what packing saves.
 
 use crate::measure::Meter;
-use reviv::engine::{Compute, Gradients, Initialise, Parameters};
+use reviv::engine::{Gradients, Initialise, Parameters};
 use reviv::masking::{Mask, Masking, MaskingSettings, Overflow, TokenBudget};
 use reviv::mget::{Batch, Content, Loss, Mget, MgetSpec, ModalitySpec, Positions, Size};
 use reviv::random::stream;
@@ -42,7 +42,7 @@ pub fn spec(size: Size) -> MgetSpec {
 
 /// Random weights.
 pub fn model(spec: &MgetSpec) -> Mget {
-    Mget::new(spec, &Initialise::new(&Compute::cpu(), 0)).expect("the spec can be built")
+    Mget::new(spec, &Initialise::new(&crate::compute(), 0)).expect("the spec can be built")
 }
 
 /// Ids that depend on sample, modality and position alone, `[modalities][tokens]`; the peer computes the same.

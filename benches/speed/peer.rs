@@ -3,6 +3,7 @@
 //! Both sides answer alike: a line of JSON on the standard output about the engine, then one per measurement. Whatever else
 //! they print there is passed over.
 
+use reviv::engine::DeviceChoice;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
@@ -50,6 +51,7 @@ pub struct Question {
     pub case: String,
     pub repeats: usize,
     pub threads: usize,
+    pub device: DeviceChoice,
 }
 
 impl Side {
@@ -58,11 +60,14 @@ impl Side {
             case,
             repeats,
             threads,
+            device,
         } = question;
         let (repeats, threads) = (repeats.to_string(), threads.to_string());
+        let device = device.to_string();
         match self {
             Self::Reviv => Command::new(std::env::current_exe()?)
                 .args([case, "--repeats", &repeats, "--threads", &threads])
+                .args(["--device", &device])
                 .output(),
             Self::PyTorch { python } => {
                 let package = Path::new(env!("CARGO_MANIFEST_DIR")).join("benches/speed/peer");
@@ -70,7 +75,7 @@ impl Side {
                     // Leave no compiled files among the sources.
                     .arg("-B")
                     .arg(package)
-                    .args([case, &repeats, &threads])
+                    .args([case, &repeats, &threads, &device])
                     .output()
             }
         }

@@ -39,7 +39,7 @@ fn data() -> Vec<Prepared> {
 }
 
 pub fn run(meter: &Meter) {
-    let compute = Compute::cpu();
+    let compute = crate::compute();
     let (model, data) = (model(&compute), data());
     let clips = batch(&model, &data);
     meter.measure("encode", || {

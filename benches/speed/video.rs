@@ -3,12 +3,12 @@
 use crate::measure::Meter;
 use ndarray::{ArrayD, IxDyn};
 use reviv::clip::Signal;
-use reviv::engine::{Compute, Initialise};
+use reviv::engine::Initialise;
 use reviv::tokenizer::Tokenizer;
 use reviv::tokenizer::video::{Network, VideoSettings, VideoTokenizer};
 
 pub fn run(meter: &Meter) {
-    let compute = Compute::cpu();
+    let compute = crate::compute();
     let network = Network::new(&Initialise::new(&compute, 0), &VideoSettings::default())
         .expect("the default sizes fit each other");
     let tokenizer = VideoTokenizer::new("rgb", [17, 256, 256], network, &compute)

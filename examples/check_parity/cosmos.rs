@@ -4,7 +4,7 @@ use std::path::Path;
 
 use burn::tensor::{Tensor, TensorData};
 use reviv::engine::parameters::to_host;
-use reviv::engine::{Compute, Initialise, Parameters, Weights};
+use reviv::engine::{Initialise, Parameters, Weights};
 use reviv::tokenizer::video::layers::Extent;
 use reviv::tokenizer::video::padding::Padding;
 use reviv::tokenizer::video::{Fsq, Network, VideoSettings, haar};
@@ -171,7 +171,7 @@ fn settings(file: &Value) -> Outcome<VideoSettings> {
 
 fn network(mut file: Vectors, report: &mut Report) -> Outcome {
     let settings = settings(&file.settings)?;
-    let compute = Compute::cpu();
+    let compute = super::compute();
     let mut network = Network::new(&Initialise::empty(&compute), &settings)?;
     let unused = settings.never_run();
     let mut weights: Weights = file.checkpoint()?;

@@ -10,7 +10,7 @@ use reviv::decoding::plan::plan;
 use reviv::decoding::schedule::{TemperatureSchedule, TokenSchedule, cosine, linear};
 use reviv::decoding::settings::{Order, Scheme, TargetChanges};
 use reviv::decoding::{DecodingSettings, MgetTokens, Sample, Slot, TokenModality};
-use reviv::engine::{Compute, Parameters, Weights};
+use reviv::engine::{Parameters, Weights};
 use reviv::mget::names::modality_from_release;
 use reviv::mget::{Content, Mget};
 use serde_json::Value;
@@ -278,7 +278,7 @@ fn generation(folder: &Path, stem: &str, report: &mut Report) -> Outcome {
     let set = folder.parent().ok_or("a folder of vectors lies in a set")?;
     let model_settings = json(&set.join("mget/reviv256_a.json"))?["settings"].clone();
     let (spec, theirs) = spec_of(&model_settings)?;
-    let mut model = Mget::empty(&spec, &Compute::cpu())?;
+    let mut model = Mget::empty(&spec, &super::compute())?;
     model.load(&parameters_of(&file.checkpoint()?, &model))?;
     let tokens = MgetTokens::new(&model);
 

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::Path;
 
 use reviv::engine::parameters::to_host;
-use reviv::engine::{Compute, Gradients, HostTensor, Parameters, Tensor, Weights};
+use reviv::engine::{Gradients, HostTensor, Parameters, Tensor, Weights};
 use reviv::masking::Mask;
 use reviv::mget::names::{from_release, modality_from_release};
 use reviv::mget::{
@@ -137,7 +137,7 @@ pub(super) fn spec_of(settings: &Value) -> Outcome<(MgetSpec, Vec<String>)> {
 
 fn fixture(file: &Vectors) -> Outcome<Fixture> {
     let (spec, theirs) = spec_of(&file.settings)?;
-    let mut model = Mget::empty(&spec, &Compute::cpu())?;
+    let mut model = Mget::empty(&spec, &super::compute())?;
     model.load(&parameters_of(&file.checkpoint()?, &model))?;
 
     let samples = file.tensor(&format!("in.{}.tensor", theirs[0]))?.shape[0];
@@ -393,7 +393,7 @@ fn gradients(file: &mut Vectors, report: &mut Report, found: &Gradients, prefix:
             continue;
         };
         if name == "__norm__" {
-            file.compare(report, &output, &[1], &[found.norm() as f32])?;
+            file.compare(report, &output, &[1], &[found.norm().read() as f32])?;
             continue;
         }
         let gradient = found

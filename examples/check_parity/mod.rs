@@ -14,7 +14,10 @@ mod vda;
 mod vda_video;
 mod vq;
 
+use std::cell::RefCell;
 use std::path::Path;
+
+use reviv::engine::Compute;
 
 use report::Report;
 
@@ -37,8 +40,19 @@ const FOLDERS: &[(&str, Check)] = &[
     ("vq", vq::check),
 ];
 
-/// Compares everything below `folder`: one known folder, or a set of them.
-pub fn check(folder: &Path) -> Outcome<Report> {
+thread_local! {
+    /// What computes.
+    static DEVICE: RefCell<Compute> = RefCell::new(Compute::cpu());
+}
+
+/// What computes.
+fn compute() -> Compute {
+    DEVICE.with_borrow(Clone::clone)
+}
+
+/// Lets `compute` compute everything below `folder`: one known folder, or a set of them; compares.
+pub fn check(folder: &Path, compute: &Compute) -> Outcome<Report> {
+    DEVICE.set(compute.clone());
     let folder = &folder
         .canonicalize()
         .map_err(|error| format!("{}: {error}", folder.display()))?;

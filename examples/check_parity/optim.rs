@@ -37,7 +37,7 @@ fn flat(values: &[f32], compute: &Compute) -> Tensor<1> {
 
 /// The largest power of nested names: a map of parameters is a model.
 fn adamw(mut file: Vectors, report: &mut Report) -> Outcome {
-    let compute = Compute::cpu();
+    let compute = super::compute();
     let mut model: BTreeMap<String, Parameter> = BTreeMap::new();
     let outputs = file.outputs();
     let names: Vec<String> = outputs
@@ -96,7 +96,7 @@ fn adamw(mut file: Vectors, report: &mut Report) -> Outcome {
 }
 
 fn clip(mut file: Vectors, report: &mut Report) -> Outcome {
-    let compute = Compute::cpu();
+    let compute = super::compute();
     for case in 0.. {
         let Some(limit) = file.settings.get(format!("clip{case}.max_norm")) else {
             break;
@@ -112,8 +112,13 @@ fn clip(mut file: Vectors, report: &mut Report) -> Outcome {
         }
         let gradients = Gradients::from_map(map);
         let norm = gradients.norm();
-        file.compare(report, &format!("clip{case}.norm"), &[1], &[norm as f32])?;
-        let factor = Gradients::clip_factor(norm, limit);
+        file.compare(
+            report,
+            &format!("clip{case}.norm"),
+            &[1],
+            &[norm.read() as f32],
+        )?;
+        let factor = norm.clip_factor(limit);
         for (part, gradient) in gradients.iter() {
             let shape = file.tensor(&format!("clip{case}.g{part}"))?.shape.clone();
             let clipped = to_host(gradient.clone() * factor);

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use ndarray::{Array3, ArrayView2};
 use reviv::engine::parameters::to_host;
-use reviv::engine::{Compute, Initialise, Parameters, Weights};
+use reviv::engine::{Initialise, Parameters, Weights};
 use reviv::evaluation::motion::{cosines, frechet_distance, mean_cosine, score01};
 use reviv::evaluation::tmr::features::{FEATURES, Features, features};
 use reviv::evaluation::tmr::resample::upsampled;
@@ -116,7 +116,7 @@ fn built(file: &Vectors) -> Outcome<MotionEncoder> {
         heads: size(&file.settings, "heads")?,
         hidden: size(&file.settings, "ff")?,
     };
-    let compute = Compute::cpu();
+    let compute = super::compute();
     let mut encoder = MotionEncoder::new(&Initialise::empty(&compute), &settings)?;
     encoder.load(&file.checkpoint()?)?;
     Ok(encoder)

@@ -236,7 +236,7 @@ fn plans(file: &Value, report: &mut Report) -> Outcome {
 }
 
 fn motion(mut file: Vectors, report: &mut Report) -> Outcome {
-    let compute = Compute::cpu();
+    let compute = super::compute();
     let weights = file.checkpoint()?;
     let module = size(&file.settings, "module")?;
     let channels = size(&file.settings, "channels")?;
@@ -291,7 +291,7 @@ fn motion(mut file: Vectors, report: &mut Report) -> Outcome {
 }
 
 fn network(mut file: Vectors, report: &mut Report) -> Outcome {
-    let compute = Compute::cpu();
+    let compute = super::compute();
     let network = built(&file, &compute)?;
     let patch = network.settings().patch;
     let x = file.tensor("x")?.clone();

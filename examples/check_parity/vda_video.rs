@@ -1,6 +1,5 @@
 //! The rest of `vda/`: windows to a video, whole videos, labels as levels.
 
-use reviv::engine::Compute;
 use reviv::labelling::levels::levels;
 use reviv::labelling::plan::{self, plan};
 use reviv::labelling::preprocess::{network_size, normalised, patches};
@@ -78,7 +77,7 @@ pub(super) fn windows(mut file: Vectors, report: &mut Report) -> Outcome {
 }
 
 pub(super) fn video(mut file: Vectors, report: &mut Report) -> Outcome {
-    let compute = Compute::cpu();
+    let compute = super::compute();
     let network = built(&file, &compute)?;
     let kind = kind(&file.settings)?;
     let video = file.tensor("frames")?.clone();

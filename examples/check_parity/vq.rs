@@ -149,7 +149,7 @@ fn flags(update: &Update, codes: usize) -> Vec<bool> {
 }
 
 fn one(mut file: Vectors, report: &mut Report) -> Outcome {
-    let compute = Compute::cpu();
+    let compute = super::compute();
     let mut model = build(&file, &compute)?;
     let (width, code) = (model.settings().width, model.settings().code_width);
     let codes = model.settings().codebook;
@@ -189,7 +189,12 @@ fn one(mut file: Vectors, report: &mut Report) -> Outcome {
         file.compare(report, name, &[1], &[value as f32])?;
     }
     let gradients = Gradients::of(&trained.loss, &model);
-    file.compare(report, "grad_norm_all", &[1], &[gradients.norm() as f32])?;
+    file.compare(
+        report,
+        "grad_norm_all",
+        &[1],
+        &[gradients.norm().read() as f32],
+    )?;
     for (name, shape, _) in model.inventory() {
         let output = format!("grad.{name}");
         if let (Some(gradient), true) = (gradients.get(&name), file.has_output(&output)) {

@@ -132,7 +132,7 @@ mod tests {
     use super::super::{Content, MgetSpec, ModalitySpec, Positions, Size};
     use super::*;
     use crate::engine::parameters::to_host;
-    use crate::engine::{Compute, Initialise};
+    use crate::engine::{Compute, DeviceChoice, Initialise, Precision};
     use crate::masking::Mask;
 
     fn spec() -> MgetSpec {
@@ -174,7 +174,11 @@ mod tests {
     }
 
     fn model() -> Mget {
-        let compute = Compute::cpu();
+        model_in(Precision::F32)
+    }
+
+    fn model_in(precision: Precision) -> Mget {
+        let compute = Compute::new(DeviceChoice::CPU, precision).unwrap();
         let mut model = Mget::new(&spec(), &Initialise::new(&compute, 3)).unwrap();
         model.start_training();
         model
@@ -205,6 +209,37 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn rounding_products_to_bf16_changes_losses_and_gradients_a_little() {
+        let batch = batch(
+            [[&[0, 2], &[1], &[0, 5]], [&[], &[3], &[]]],
+            [[&[1], &[0, 2], &[]], [&[0, 1, 2], &[], &[]]],
+        );
+        let found = [Precision::F32, Precision::Bf16].map(|precision| {
+            let model = model_in(precision);
+            let losses = model.losses(&batch, Loss::Mod);
+            let gradients = Gradients::of(losses.total.as_ref().unwrap(), &model);
+            let norm = gradients.norm().read();
+            (losses.values().total, norm, gradients)
+        });
+        let [(loss, norm, exact), (loss16, norm16, rounded)] = found;
+        assert!(
+            loss != loss16 && (loss16 / loss - 1.0).abs() < 2e-2,
+            "{loss} {loss16}"
+        );
+        assert!((norm16 / norm - 1.0).abs() < 2e-2, "{norm} {norm16}");
+        let apart: f64 = exact
+            .iter()
+            .map(|(name, gradient)| {
+                let other = rounded.get(name).unwrap().clone();
+                let off = to_host(gradient.clone() - other);
+                off.into_iter().map(|x| f64::from(x).powi(2)).sum::<f64>()
+            })
+            .sum();
+        let apart = apart.sqrt() / norm;
+        assert!(apart > 0.0 && apart < 2e-2, "{apart}");
     }
 
     #[test]

@@ -7,9 +7,9 @@
 use super::batch::{EncoderInput, Sequence, Values};
 use super::positions;
 use super::spec::{MgetSpec, SpecError};
-use crate::engine::ops::{embedding, linear};
+use crate::engine::ops::{embedding, linear_in};
 use crate::engine::parameters::{Kind, VisitMut, join};
-use crate::engine::{Initialise, Parameter, Parameters, Tensor};
+use crate::engine::{Initialise, Parameter, Parameters, Precision, Tensor};
 
 /// The encoder's side of every modality, and the places.
 #[derive(Debug, Clone)]
@@ -20,6 +20,7 @@ pub(super) struct Embeddings {
     /// Per modality: its first row in `positions`.
     offsets: Vec<u32>,
     width: usize,
+    precision: Precision,
 }
 
 #[derive(Debug, Clone)]
@@ -113,6 +114,7 @@ impl Embeddings {
             positions: Parameter::new(Kind::Buffer, table, &[rows, width], init.compute().device()),
             offsets,
             width,
+            precision: init.compute().precision(),
         })
     }
 
@@ -135,7 +137,7 @@ impl Embeddings {
                 (Content::Table(table), Values::Ids(ids)) => embedding(table.tensor(), ids),
                 (Content::Tubelets(map), Values::Tubelets(values)) => {
                     let tubelets_NP = self.rows_of(values, map.shape()[1]);
-                    linear(tubelets_NP, map.tensor(), None)
+                    linear_in(self.precision, tubelets_NP, map.tensor(), None)
                 }
                 _ => unreachable!("batches are built from the same spec"),
             });
@@ -184,6 +186,7 @@ impl Embeddings {
 pub(super) struct Heads {
     /// Per modality of the spec; raw video has none.
     tables: Vec<Option<(String, Parameter)>>,
+    precision: Precision,
 }
 
 impl Parameters for Heads {
@@ -218,7 +221,15 @@ impl Heads {
                 Some((modality.name.clone(), table))
             })
             .collect();
-        Self { tables }
+        Self {
+            tables,
+            precision: init.compute().precision(),
+        }
+    }
+
+    /// What products with the tables are computed in.
+    pub(super) fn precision(&self) -> Precision {
+        self.precision
     }
 
     /// The output matrix of a modality, `[V, D]`.
@@ -249,6 +260,11 @@ impl Heads {
         if rows.is_empty() {
             return None;
         }
-        Some(linear(Self::rows(y_MD, rows), self.table(modality)?, None))
+        Some(linear_in(
+            self.precision,
+            Self::rows(y_MD, rows),
+            self.table(modality)?,
+            None,
+        ))
     }
 }

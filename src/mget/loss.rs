@@ -5,6 +5,7 @@ use super::embedding::Heads;
 use super::spec::MgetSpec;
 use crate::engine::Tensor;
 use crate::engine::ops::tied_cross_entropy;
+use crate::engine::parameters::to_host;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -52,19 +53,23 @@ pub struct LossValues {
 }
 
 impl Losses {
-    /// Reads the numbers back.
+    /// Reads the numbers back, at once.
     #[must_use]
     pub fn values(&self) -> LossValues {
-        let number = |tensor: &Tensor<1>| {
-            let values = crate::engine::parameters::to_host(tensor.clone());
-            values.first().map_or(f64::NAN, |value| f64::from(*value))
-        };
+        let means = self.modalities.iter().flatten().map(|loss| &loss.mean);
+        let all: Vec<Tensor<1>> = self.total.iter().chain(means).cloned().collect();
+        let mut read = Vec::new().into_iter();
+        if !all.is_empty() {
+            let untracked = all.into_iter().map(Tensor::without_autodiff).collect();
+            read = to_host(Tensor::cat(untracked, 0)).into_iter();
+        }
+        let mut next = || read.next().map_or(f64::NAN, f64::from);
         LossValues {
-            total: self.total.as_ref().map_or(0.0, number),
+            total: self.total.as_ref().map_or(0.0, |_| next()),
             modalities: self
                 .modalities
                 .iter()
-                .map(|loss| loss.as_ref().map(|loss| (number(&loss.mean), loss.tokens)))
+                .map(|loss| loss.as_ref().map(|loss| (next(), loss.tokens)))
                 .collect(),
         }
     }
@@ -89,7 +94,7 @@ pub(super) fn losses(
             continue;
         };
         let y_mD = Heads::rows(&y_MD, &targets.sequence.rows[index]);
-        let nats_m = tied_cross_entropy(y_mD, table_VD, ids);
+        let nats_m = tied_cross_entropy(heads.precision(), y_mD, table_VD, ids);
         modalities[index] = Some(ModalityLoss {
             mean: nats_m.mean(),
             tokens: ids.len(),

@@ -82,7 +82,8 @@ pub struct Reconstructed {
 }
 
 impl Model {
-    /// Opens a model folder and checks that its parts belong together.
+    /// Opens a model folder and checks that its parts belong together. The precision of `compute` is that of the transformer; its
+    /// tokenizers are f32.
     ///
     /// # Errors
     /// When a part is missing, damaged, or another one than the model was trained on.
@@ -122,7 +123,7 @@ impl Model {
                     found,
                 });
             }
-            tokenizers.insert_as(name, tokenizer::open(&path, compute)?.into());
+            tokenizers.insert_as(name, tokenizer::open(&path, &compute.in_f32())?.into());
         }
         Ok(Self::new(mget, tokenizers)?.with_trained_on(manifest.trained_on))
     }

@@ -54,6 +54,8 @@ pub struct PredictSettings {
     /// best of them. 1 writes none.
     #[schemars(range(min = 1, max = 64))]
     pub samples: usize,
+    /// What operands of the transformer's products are rounded to.
+    pub precision: Precision,
 }
 
 impl Default for PredictSettings {
@@ -70,6 +72,7 @@ impl Default for PredictSettings {
             reconstruction_bound: true,
             device: DeviceChoice::CPU,
             samples: 1,
+            precision: Precision::F32,
         }
     }
 }
@@ -232,7 +235,7 @@ impl Op for Predict {
         context: &mut dyn StageContext,
     ) -> Result<Value, StageError> {
         let _memory = crate::engine::memory::Stage;
-        let compute = compute(settings.device, Precision::F32, context)?;
+        let compute = compute(settings.device, settings.precision, context)?;
         let model = artifact(context, "model")?;
         let model = Model::open(&model.path, &compute).map_err(refused)?;
         let root = artifact(context, "clips")?.path.join(&settings.split);

@@ -7,7 +7,7 @@ mod run;
 
 use super::predict::{artifact, takes_pixels};
 use crate::decoding::DecodingSettings;
-use crate::engine::DeviceChoice;
+use crate::engine::{DeviceChoice, Precision};
 use crate::experiment::{
     Arity, ArtifactKind, Code, Description, Entry, FileInput, FilePath, Inputs, Op, OpEntry, Port,
     Problem, StageContext, StageError, StagePlan,
@@ -65,6 +65,8 @@ pub struct ReconstructSettings {
     pub anchor_model: Option<FilePath>,
     /// Where the models run.
     pub device: DeviceChoice,
+    /// What operands of the transformer's products are rounded to.
+    pub precision: Precision,
 }
 
 impl Default for ReconstructSettings {
@@ -90,6 +92,7 @@ impl Default for ReconstructSettings {
             anchor: None,
             anchor_model: None,
             device: DeviceChoice::CPU,
+            precision: Precision::F32,
         }
     }
 }

@@ -57,7 +57,7 @@ pub struct TrainMgetSettings {
     pub train_share: f64,
     /// Where to train.
     pub device: DeviceChoice,
-    /// Precision of matrix products; weights, norms and losses are always f32.
+    /// What operands of matrix products are rounded to; sums, weights, norms and losses are always f32.
     pub precision: Precision,
     #[serde(flatten)]
     pub training: TrainingSettings,
@@ -175,10 +175,6 @@ impl Op for TrainMget {
                 "weights",
                 format!("{} weights for {sets} data sets", settings.weights.len()),
             ));
-        }
-        if settings.precision == Precision::Bf16 {
-            let message = "`bf16` is not available: no operation computes in it yet";
-            problems.push(Problem::new(Code::E0206, "precision", message).help("use `f32`"));
         }
         let shape = pixel_shape(tokens);
         if settings.pixels == Pixels::Rgb && shape.is_none() {

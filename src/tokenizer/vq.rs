@@ -439,10 +439,11 @@ impl VqVae {
         let commitment = step_NL.clone().square().mean();
         let found_NP = self.decode_latents(z_NL + step_NL.detach(), batch.samples);
         let reconstruction = self.loss(found_NP, batch);
-        let scalar = |x: &Tensor<1>| f64::from(to_host(x.clone())[0]);
+        let parts = vec![reconstruction.clone(), commitment.clone()];
+        let parts = to_host(Tensor::cat(parts, 0));
         Trained {
-            reconstruction: scalar(&reconstruction),
-            commitment: scalar(&commitment),
+            reconstruction: f64::from(parts[0]),
+            commitment: f64::from(parts[1]),
             loss: reconstruction + commitment * self.settings.commitment_weight,
             assignment,
         }

@@ -40,9 +40,11 @@ impl MaskedPrediction {
             return self.model.recomputed(batch, self.loss, share);
         }
         let losses = self.model.losses(batch, self.loss);
-        let values = losses.values();
-        let total = losses.total.filter(|_| values.total.is_finite());
+        let total = losses.total.clone();
+        // Before the losses are read, so that a GPU has all of its work when somebody waits for it.
         let gradients = total.map(|total| Gradients::of(&(total * share), &self.model));
+        let values = losses.values();
+        let gradients = gradients.filter(|_| values.total.is_finite());
         (values, gradients)
     }
 }

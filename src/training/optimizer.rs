@@ -133,7 +133,7 @@ impl AdamW {
         rate: f64,
     ) -> Result<f64, NotFinite> {
         let norm = gradients.norm();
-        if !norm.is_finite() {
+        if let Some(norm) = norm.known().filter(|norm| !norm.is_finite()) {
             return Err(NotFinite {
                 step: self.step + 1,
                 norm,
@@ -141,12 +141,9 @@ impl AdamW {
         }
         self.step += 1;
         let settings = &self.settings;
-        let scale = settings
-            .clip_norm
-            .map_or(1.0, |limit| Gradients::clip_factor(norm, limit));
         let exponent = i32::try_from(self.step).unwrap_or(i32::MAX);
         let mut step = AdamWStep {
-            gradient_scale: scale,
+            clip: settings.clip_norm,
             betas: settings.betas,
             epsilon: settings.epsilon,
             decay: 0.0,
@@ -167,11 +164,26 @@ impl AdamW {
                 0.0
             };
             let tracked = parameter.is_tracked();
-            let (values, mean, square) =
-                ops::adamw(parameter.take(), gradient, state.mean, state.square, step);
+            let (values, mean, square) = ops::adamw(
+                parameter.take(),
+                gradient,
+                state.mean,
+                state.square,
+                &norm,
+                step,
+            );
             parameter.put(values, tracked);
             moments.insert(name.to_owned(), Moments { mean, square });
         });
+        // On a device the step has refused itself; nobody has waited for it so far.
+        let norm = norm.read();
+        if !norm.is_finite() {
+            self.step -= 1;
+            return Err(NotFinite {
+                step: self.step + 1,
+                norm,
+            });
+        }
         Ok(norm)
     }
 

@@ -57,7 +57,7 @@ fn an_imported_transformer_reproduces_every_number_of_the_reference() {
         let own = if name == "mget" { &replaced[..] } else { &[] };
         copy_of(&vectors, &set, name, own);
     }
-    let report = check_parity::check(&set).unwrap();
+    let report = check_parity::check(&set, &reviv::Compute::cpu()).unwrap();
     assert!(report.passed(), "{report}");
 }
 
@@ -123,7 +123,7 @@ fn imported_signal_tokenizers_reproduce_every_number_of_the_reference() {
     }
     let set = temporary.path().join("set");
     copy_of(&vectors, &set, "vq", &replaced);
-    let report = check_parity::check(&set).unwrap();
+    let report = check_parity::check(&set, &reviv::Compute::cpu()).unwrap();
     assert!(report.passed(), "{report}");
 }
 
@@ -217,7 +217,7 @@ fn an_imported_video_tokenizer_reproduces_every_number_of_the_reference() {
     let set = temporary.path().join("set");
     let folder = copy_of(&vectors, &set, "cosmos", &replaced);
     assert!(folder.join("padding.json").is_file());
-    let report = check_parity::check(&set).unwrap();
+    let report = check_parity::check(&set, &reviv::Compute::cpu()).unwrap();
     assert!(report.passed(), "{report}");
 }
 

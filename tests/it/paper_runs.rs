@@ -183,10 +183,10 @@ fn every_experiment_of_the_paper_runs_end_to_end_at_a_tiny_size() {
     };
     let layouts = shared.join("layouts");
     if !layouts.is_dir() {
-        eprintln!(
-            "skipped: {} is not there: no samples to run the paper's experiments on",
+        crate::skipped::skipped(&format!(
+            "{} is not there: no samples to run the paper's experiments on",
             layouts.display()
-        );
+        ));
         return;
     }
     let adt: Option<PathBuf> = Some(shared.join("data/adt_sample")).filter(|path| path.is_dir());
@@ -198,7 +198,9 @@ fn every_experiment_of_the_paper_runs_end_to_end_at_a_tiny_size() {
         let (planned, _, said) = reviv(folder.path(), &["plan", name]);
         assert!(planned, "plan {name}: {said}");
         if adt.is_none() && said.contains("`adt`") {
-            eprintln!("skipped: {name} needs the sample of Aria Digital Twin, which is not there");
+            crate::skipped::skipped(&format!(
+                "{name} needs the sample of Aria Digital Twin, which is not there"
+            ));
             continue;
         }
         let (checked, _, said) = reviv(folder.path(), &["check", name]);

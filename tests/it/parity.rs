@@ -3,12 +3,14 @@
 #[path = "../../examples/check_parity/mod.rs"]
 pub mod check_parity;
 
+use reviv::engine::Compute;
+
 #[test]
 fn every_tensor_of_the_parity_vectors_matches() {
     let Some(shared) = crate::shared::folder() else {
         return;
     };
-    let report = check_parity::check(&shared.join("vectors/parity")).unwrap();
+    let report = check_parity::check(&shared.join("vectors/parity"), &Compute::cpu()).unwrap();
     assert!(report.passed(), "{report}");
 }
 
@@ -18,7 +20,8 @@ fn every_tensor_of_the_depth_and_motion_vectors_matches() {
         return;
     };
     for folder in ["vda", "tmr"] {
-        let report = check_parity::check(&shared.join("vectors").join(folder)).unwrap();
+        let report =
+            check_parity::check(&shared.join("vectors").join(folder), &Compute::cpu()).unwrap();
         assert!(report.passed(), "{report}");
     }
 }

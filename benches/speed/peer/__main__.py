@@ -1,6 +1,8 @@
-"""PyTorch's side of `cargo bench --bench speed`: eager, f32, on the CPU, as one would write it by hand.
+"""PyTorch's side of `cargo bench --bench speed`: eager, f32, as one would write it by hand.
 
-usage: python benches/speed/peer CASE REPEATS THREADS
+usage: python benches/speed/peer CASE REPEATS THREADS [DEVICE]
+
+DEVICE is `cpu` or, with a number or not, `cuda`.
 
 Says what `benches/speed/peer.rs` reads: a line of JSON about PyTorch, then one per measurement. Weights are random; shapes,
 passes and arithmetic are those of our side.
@@ -9,6 +11,9 @@ passes and arithmetic are those of our side.
 import sys
 
 import torch
+
+# Before anything else makes a tensor.
+torch.set_default_device(sys.argv[4] if len(sys.argv) > 4 else "cpu")
 
 import decoding
 import depth

@@ -3,7 +3,6 @@
 use super::super::device::compute;
 use super::ReconstructSettings;
 use crate::clip::store::ClipSet;
-use crate::engine::Precision;
 use crate::experiment::{Code, StageContext, StageError};
 use crate::flow::Flow;
 use crate::modality::ClipFormat;
@@ -72,7 +71,7 @@ pub(super) fn run(
     context: &mut dyn StageContext,
 ) -> Result<Value, StageError> {
     let mut times = Times::start();
-    let compute = compute(settings.device, Precision::F32, context)?;
+    let compute = compute(settings.device, settings.precision, context)?;
     let model = Model::open(model, &compute).map_err(refused)?;
     times.lap("open the model");
     let options = options(settings, context.seed());

@@ -4,7 +4,7 @@ use std::borrow::Cow;
 use std::fmt;
 use std::str::FromStr;
 
-use burn::tensor::Device;
+use burn::tensor::{DType, Device};
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::{Deserialize, Serialize};
 
@@ -181,23 +181,24 @@ impl JsonSchema for DeviceChoice {
     }
 }
 
-/// In which numbers matrix products are computed: f32 for now, on every device. Norms, softmax, losses, codebooks and weights are
-/// always f32.
+/// What the operands of the transformer's matrix products are rounded to; sums are f32. Norms, attention, softmax, losses, codebooks,
+/// weights and their gradients are always f32.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Precision {
     /// Single precision, 32 bits.
     #[default]
     F32,
-    /// bfloat16: not available, no operation computes in it yet.
+    /// bfloat16, on devices that have it; the processor rounds to the same numbers, and is not faster for it.
     Bf16,
 }
 
-/// A device that computes in f32.
+/// A device, and the precision of its products.
 #[derive(Debug, Clone)]
 pub struct Compute {
     device: Device,
     choice: DeviceChoice,
+    precision: Precision,
 }
 
 impl Compute {
@@ -207,13 +208,14 @@ impl Compute {
         Self {
             device: Device::flex(),
             choice: DeviceChoice::CPU,
+            precision: Precision::F32,
         }
     }
 
     /// The device `choice`, computing in `precision`. [`Compute::name`] says what `auto` took.
     ///
     /// # Errors
-    /// When this build or this machine has no such device, or no operation computes in `precision`.
+    /// When this build or this machine has no such device, or the device does not compute in `precision`.
     pub fn new(choice: DeviceChoice, precision: Precision) -> Result<Self, EngineError> {
         let found = match choice.kind {
             DeviceKind::Auto => first_gpu(),
@@ -221,13 +223,29 @@ impl Compute {
             _ => Some(Self::gpu(choice)?),
         };
         let found = found.unwrap_or_else(Self::cpu);
-        if precision == Precision::Bf16 {
+        let on_gpu = found.choice != DeviceChoice::CPU;
+        if precision == Precision::Bf16 && on_gpu && !found.device.supports_dtype(DType::BF16) {
             return Err(EngineError::Precision {
                 precision: "bf16",
-                device: found.choice.to_string(),
+                device: found.name(),
             });
         }
-        Ok(found)
+        Ok(Self { precision, ..found })
+    }
+
+    /// The same device in f32.
+    #[must_use]
+    pub fn in_f32(&self) -> Self {
+        Self {
+            precision: Precision::F32,
+            ..self.clone()
+        }
+    }
+
+    /// What products are computed in.
+    #[must_use]
+    pub fn precision(&self) -> Precision {
+        self.precision
     }
 
     fn gpu(choice: DeviceChoice) -> Result<Self, EngineError> {
@@ -241,13 +259,24 @@ impl Compute {
         }
         let device = found(choice.kind).into_iter().nth(choice.index);
         let device = device.ok_or_else(|| refused(not_there))?;
-        Ok(Self { device, choice })
+        Ok(Self {
+            device,
+            choice,
+            precision: Precision::F32,
+        })
     }
 
     /// The tensor library's handle.
     #[must_use]
     pub fn device(&self) -> &Device {
         &self.device
+    }
+
+    /// Bytes that arrays hold on the device, and what is kept for the next ones; `None` for the processor.
+    #[must_use]
+    pub fn memory(&self) -> Option<u64> {
+        let usage = self.device.memory_pool_usage()?;
+        (self.choice != DeviceChoice::CPU).then_some(usage.bytes_reserved)
     }
 
     /// What computes, never [`DeviceKind::Auto`].
@@ -273,7 +302,11 @@ fn first_gpu() -> Option<Compute> {
     kinds.filter(|kind| kind.built()).find_map(|kind| {
         let choice = DeviceChoice::first(kind);
         let device = found(kind).into_iter().find(is_hardware)?;
-        Some(Compute { device, choice })
+        Some(Compute {
+            device,
+            choice,
+            precision: Precision::F32,
+        })
     })
 }
 
@@ -319,8 +352,7 @@ fn found(_: DeviceKind) -> Vec<Device> {
 /// Whether a GPU is one, and not a program.
 #[cfg(any(feature = "vulkan", feature = "metal", feature = "wgpu"))]
 fn is_hardware(device: &Device) -> bool {
-    use burn::backend::{DispatchDevice, wgpu::WgpuDeviceKind};
-    use burn_cubecl::CubeDevice;
+    use burn::backend::{CubeDevice, DispatchDevice, WgpuDeviceKind};
     match device.as_dispatch() {
         DispatchDevice::Cube(CubeDevice::Wgpu(device)) => device.kind != WgpuDeviceKind::Cpu,
         _ => true,
@@ -348,13 +380,17 @@ mod tests {
     use super::*;
 
     #[test]
-    fn bf16_is_refused_by_name_with_the_device() {
-        let error = Compute::new(DeviceChoice::CPU, Precision::Bf16).unwrap_err();
-        let message = error.to_string();
-        assert!(
-            message.contains("`bf16`") && message.contains("`cpu`"),
-            "{message}"
-        );
+    fn a_device_without_bf16_is_named() {
+        assert!(Compute::new(DeviceChoice::CPU, Precision::Bf16).is_ok());
+        // WGSL has no such numbers.
+        if let Ok(gpu) = Compute::new(DeviceChoice::first(DeviceKind::Wgpu), Precision::F32) {
+            let error = Compute::new(gpu.choice(), Precision::Bf16).unwrap_err();
+            let message = error.to_string();
+            assert!(
+                message.contains("`bf16`") && message.contains("wgpu"),
+                "{message}"
+            );
+        }
     }
 
     #[test]

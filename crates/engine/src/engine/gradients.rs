@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use burn::tensor::Tensor;
 
-use super::ops;
+use super::ops::Norm;
 use super::parameters::Parameters;
 
 /// One flat gradient per trainable parameter of a model. A parameter that took no part has a gradient of zeros, as in the
@@ -111,17 +111,7 @@ impl Gradients {
 
     /// The Euclidean norm over all gradients together.
     #[must_use]
-    pub fn norm(&self) -> f64 {
-        self.by_name
-            .values()
-            .map(|tensor| ops::sum_of_squares(tensor.clone()))
-            .sum::<f64>()
-            .sqrt()
-    }
-
-    /// The factor that brings a gradient of norm `norm` down to `max_norm`: `min(1, max_norm / (norm + 1e-6))`.
-    #[must_use]
-    pub fn clip_factor(norm: f64, max_norm: f64) -> f64 {
-        (max_norm / (norm + 1e-6)).min(1.0)
+    pub fn norm(&self) -> Norm {
+        Norm::of(self.by_name.values())
     }
 }

@@ -38,6 +38,7 @@ pub use weights::{HostTensor, Values, Weights};
 pub enum EngineError {
     /// The device asked for is none of this machine, or this program was built without its kind.
     #[error("there is no device `{device}`: {hint}")]
+<<<<<<< HEAD
     NoSuchDevice {
         /// Kind and number: `cuda:0`, `vulkan:1`.
         device: String,
@@ -48,6 +49,10 @@ pub enum EngineError {
     #[error(
         "precision `{precision}` is not available on `{device}`: no operation computes in it yet; use `f32`"
     )]
+=======
+    NoSuchDevice { device: String, hint: &'static str },
+    #[error("the device `{device}` does not compute in `{precision}`; use `precision: f32`")]
+>>>>>>> main
     Precision {
         /// As it is written in settings.
         precision: &'static str,

@@ -2,7 +2,7 @@
 
 use burn::tensor::Tensor;
 
-use crate::engine::{Initialise, Parameter, ops, parameters};
+use crate::engine::{Initialise, Parameter, Precision, ops, parameters};
 
 /// Layer norms add this to the variance.
 pub const EPSILON: f64 = 1e-6;
@@ -14,6 +14,7 @@ pub struct Linear {
     pub weight: Parameter,
     /// `[out]`.
     pub bias: Option<Parameter>,
+    precision: Precision,
 }
 parameters!(Linear { weight, bias });
 
@@ -36,13 +37,15 @@ impl Linear {
         Self {
             weight: init.xavier("weight", &[outputs, inputs], inputs, outputs / parts),
             bias: bias.then(|| init.constant(&[outputs], 0.0)),
+            precision: init.compute().precision(),
         }
     }
 
     /// `[N, in]` to `[N, out]`.
     #[must_use]
     pub fn forward(&self, x: Tensor<2>) -> Tensor<2> {
-        ops::linear(
+        ops::linear_in(
+            self.precision,
             x,
             self.weight.tensor(),
             self.bias.as_ref().map(Parameter::tensor),

@@ -5,6 +5,8 @@
 
 mod conv_window;
 mod fused;
+#[cfg(feature = "kernels")]
+mod gpu;
 mod nearest;
 mod resize;
 mod unfused;
@@ -16,9 +18,9 @@ pub use resize::{Resize, Step, steps};
 /// Matrix products on slices of the host.
 pub use reviv_gemm as gemm;
 
-use burn::tensor::{Int, Tensor, TensorData};
+use burn::tensor::{DType, Int, Tensor, TensorData};
 
-use super::Segments;
+use super::{Precision, Segments};
 use fused::Fused;
 
 /// Added to the variance of a frame.
@@ -57,6 +59,26 @@ pub fn linear(x: Tensor<2>, weight: Tensor<2>, bias: Option<Tensor<1>>) -> Tenso
     unfused::linear(x, weight, bias)
 }
 
+/// [`linear`] with operands rounded to `precision`; sums are f32, and so is what comes out.
+#[must_use]
+pub fn linear_in(
+    precision: Precision,
+    x: Tensor<2>,
+    weight: Tensor<2>,
+    bias: Option<Tensor<1>>,
+) -> Tensor<2> {
+    match precision {
+        Precision::F32 => linear(x, weight, bias),
+        Precision::Bf16 if fused::takes(&x) => linear(rounded(x), rounded(weight), bias),
+        Precision::Bf16 => unfused::linear_bf16(x, weight, bias),
+    }
+}
+
+/// To the next bfloat16, held in f32.
+fn rounded(x: Tensor<2>) -> Tensor<2> {
+    x.cast(DType::BF16).cast(DType::F32)
+}
+
 /// Each row to mean 0 and variance 1 (biased, plus `epsilon`), times `weight`, plus `bias`.
 #[must_use]
 pub fn layer_norm(
@@ -69,6 +91,16 @@ pub fn layer_norm(
         let epsilon = epsilon as f32;
         return fused::run(Fused::LayerNorm { epsilon }, x, Some(weight), bias);
     }
+    #[cfg(feature = "kernels")]
+    if gpu::takes(&x) && x.dims()[0] > 0 {
+        let epsilon = epsilon as f32;
+        let y: Tensor<2> = gpu::run(gpu::Operation::Standardise { epsilon }, x, None);
+        let y = y * weight.unsqueeze();
+        return match bias {
+            Some(bias) => y + bias.unsqueeze(),
+            None => y,
+        };
+    }
     unfused::layer_norm(x, weight, bias, epsilon)
 }
 
@@ -80,6 +112,11 @@ pub fn self_attention(qkv: Tensor<2>, heads: usize, segments: &Segments) -> Tens
     if fused::takes(&qkv) {
         let segments = segments.clone();
         return fused::run(Fused::Attention { heads, segments }, qkv, NONE, NONE);
+    }
+    #[cfg(feature = "kernels")]
+    if gpu::takes(&qkv) && segments.queries() > 0 {
+        let segments = segments.clone();
+        return gpu::run(gpu::Operation::SelfAttention { heads, segments }, qkv, None);
     }
     unfused::self_attention(qkv, heads, segments)
 }
@@ -99,6 +136,15 @@ pub fn cross_attention(
         let segments = segments.clone();
         return fused::run(Fused::Attention { heads, segments }, q, Some(kv), NONE);
     }
+    #[cfg(feature = "kernels")]
+    if gpu::takes(&q) && segments.queries() > 0 && segments.keys() > 0 {
+        let segments = segments.clone();
+        return gpu::run(
+            gpu::Operation::CrossAttention { heads, segments },
+            q,
+            Some(kv),
+        );
+    }
     unfused::cross_attention(q, kv, heads, segments)
 }
 
@@ -107,6 +153,10 @@ pub fn cross_attention(
 pub fn gelu<const D: usize>(x: Tensor<D>) -> Tensor<D> {
     if fused::takes(&x) {
         return fused::run(Fused::Gelu, x, NONE, NONE);
+    }
+    #[cfg(feature = "kernels")]
+    if gpu::takes(&x) && x.shape().num_elements() > 0 {
+        return gpu::run(gpu::Operation::Gelu, x, None);
     }
     burn::tensor::activation::gelu(x)
 }
@@ -126,6 +176,10 @@ pub fn swiglu(gate: Tensor<2>, value: Tensor<2>) -> Tensor<2> {
     if fused::takes(&gate) {
         return fused::run(Fused::SwiGlu, gate, Some(value), NONE);
     }
+    #[cfg(feature = "kernels")]
+    if gpu::takes(&gate) && gate.dims()[0] > 0 {
+        return gpu::run(gpu::Operation::SwiGlu, gate, Some(value));
+    }
     burn::tensor::activation::silu(gate) * value
 }
 
@@ -140,15 +194,31 @@ pub fn cross_entropy(logits: Tensor<2>, targets: &[u32]) -> Tensor<1> {
     unfused::cross_entropy(logits, targets)
 }
 
-/// [`cross_entropy`] of the logits `x table^T`, without keeping all of them: `x` is `[N, D]`, `table` `[V, D]`. Gives `[N]`.
+/// [`cross_entropy`] of the logits `x table^T`, without keeping all of them: `x` is `[N, D]`, `table` `[V, D]`. Gives `[N]`. The
+/// operands of the product are rounded to `precision`.
 #[must_use]
-pub fn tied_cross_entropy(x: Tensor<2>, table: Tensor<2>, targets: &[u32]) -> Tensor<1> {
+pub fn tied_cross_entropy(
+    precision: Precision,
+    x: Tensor<2>,
+    table: Tensor<2>,
+    targets: &[u32],
+) -> Tensor<1> {
     check_targets(targets, [x.dims()[0], table.dims()[0]]);
     if fused::takes(&x) {
+        let (x, table) = match precision {
+            Precision::F32 => (x, table),
+            Precision::Bf16 => (rounded(x), rounded(table)),
+        };
         let targets = targets.into();
         return fused::run(Fused::TiedCrossEntropy { targets }, x, Some(table), NONE);
     }
-    unfused::cross_entropy(unfused::linear(x, table, None), targets)
+    #[cfg(feature = "kernels")]
+    if gpu::takes(&x) && !targets.is_empty() {
+        let targets = targets.into();
+        let operation = gpu::Operation::TiedCrossEntropy { targets, precision };
+        return gpu::run(operation, x, Some(table));
+    }
+    unfused::cross_entropy(linear_in(precision, x, table, None), targets)
 }
 
 /// A factorised causal convolution over video on packed rows: `x` `[N, C]`, one row per pixel of
@@ -208,6 +278,10 @@ pub fn resize(x: Tensor<2>, resize: Resize) -> Tensor<2> {
 /// The rows `ids` of `table` `[V, D]`: `[N, D]`.
 #[must_use]
 pub fn embedding(table: Tensor<2>, ids: &[u32]) -> Tensor<2> {
+    #[cfg(feature = "kernels")]
+    if gpu::takes(&table) && !ids.is_empty() {
+        return gpu::run(gpu::Operation::Embedding { ids: ids.into() }, table, None);
+    }
     let ids = indices(ids, &table);
     table.select(0, ids)
 }
@@ -223,13 +297,62 @@ pub fn indices(ids: &[u32], like: &Tensor<2>) -> Tensor<1, Int> {
     )
 }
 
-/// The sum of squares of all elements.
-#[must_use]
-pub fn sum_of_squares(x: Tensor<1>) -> f64 {
-    if fused::takes(&x) {
-        return fused::sum_of_squares(x.without_autodiff());
+/// The Euclidean norm of several arrays together, where they are.
+#[derive(Debug, Clone)]
+pub enum Norm {
+    /// On the processor: known.
+    Host(f64),
+    /// On a device, `[1]`: reading it waits for everything before it.
+    Device(Tensor<1>),
+}
+
+impl Norm {
+    /// The norm of arrays that are all on one device.
+    #[must_use]
+    pub fn of<'a>(arrays: impl Iterator<Item = &'a Tensor<1>>) -> Self {
+        let (mut host, mut device) = (0.0, Vec::new());
+        for x in arrays {
+            let x = x.clone().without_autodiff();
+            if fused::takes(&x) {
+                host += fused::sum_of_squares(x);
+                continue;
+            }
+            #[cfg(feature = "kernels")]
+            if gpu::takes(&x) {
+                device.push(gpu::sum_of_squares(x));
+                continue;
+            }
+            device.push(unfused::sum_of_squares(x));
+        }
+        if device.is_empty() {
+            return Self::Host(host.sqrt());
+        }
+        Self::Device(Tensor::cat(device, 0).sum().sqrt())
     }
-    unfused::sum_of_squares(x)
+
+    /// What is known without waiting.
+    #[must_use]
+    pub fn known(&self) -> Option<f64> {
+        match self {
+            Self::Host(norm) => Some(*norm),
+            Self::Device(_) => None,
+        }
+    }
+
+    /// Reads it.
+    #[must_use]
+    pub fn read(&self) -> f64 {
+        match self {
+            Self::Host(norm) => *norm,
+            Self::Device(norm) => norm.clone().into_scalar::<f64>(),
+        }
+    }
+
+    /// The factor that brings a gradient of this norm down to `limit`: `min(1, limit / (norm + 1e-6))`.
+    #[must_use]
+    pub fn clip_factor(&self, limit: f64) -> f64 {
+        (limit / (self.read() + 1e-6)).min(1.0)
+    }
 }
 
 /// The scalars of one AdamW step of one parameter, bias corrections included.
@@ -238,6 +361,8 @@ pub struct AdamWStep {
     /// Gradients are multiplied by this first (clipping).
     pub gradient_scale: f64,
     /// How much of the running mean and of the running mean square is kept, each in `[0, 1)`.
+    /// Gradients are brought down to this norm first.
+    pub clip: Option<f64>,
     pub betas: [f64; 2],
     /// Added to the root of the corrected mean square.
     pub epsilon: f64,
@@ -249,17 +374,24 @@ pub struct AdamWStep {
     pub square_correction: f64,
 }
 
-/// One AdamW step: new `(values, mean, square)`, in place where nobody else holds them.
+/// One AdamW step: new `(values, mean, square)`, in place where nobody else holds them. `norm` is that of all gradients together;
+/// where a device has it and it is not finite, nothing changes.
 #[must_use]
 pub fn adamw(
     values: Tensor<1>,
     gradient: Tensor<1>,
     mean: Tensor<1>,
     square: Tensor<1>,
+    norm: &Norm,
     step: AdamWStep,
 ) -> (Tensor<1>, Tensor<1>, Tensor<1>) {
-    if fused::takes(&values) {
-        return fused::adamw(values, gradient, mean, square, step);
+    #[cfg(feature = "kernels")]
+    if let (true, Norm::Device(norm)) = (gpu::takes(&values), norm) {
+        return gpu::adamw(values, gradient, mean, square, norm, step);
     }
-    unfused::adamw(values, gradient, mean, square, step)
+    let scale = step.clip.map_or(1.0, |limit| norm.clip_factor(limit));
+    if fused::takes(&values) {
+        return fused::adamw(values, gradient, mean, square, scale, step);
+    }
+    unfused::adamw(values, gradient, mean, square, scale, step)
 }

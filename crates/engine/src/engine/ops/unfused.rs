@@ -1,12 +1,21 @@
 //! Every operation unfused of the tensor library's own: what runs on GPU back ends, and what fused ones are tested against.
 
-use burn::tensor::{Tensor, TensorData, activation};
+use burn::tensor::{DType, Tensor, TensorData, activation};
 
 use super::super::Segments;
 use super::{AdamWStep, ConvWindow, FRAME_NORM_EPSILON, Resize, Step, indices, steps};
 
 pub fn linear(x: Tensor<2>, weight: Tensor<2>, bias: Option<Tensor<1>>) -> Tensor<2> {
     let y = x.matmul(weight.transpose());
+    match bias {
+        Some(bias) => y + bias.unsqueeze(),
+        None => y,
+    }
+}
+
+pub fn linear_bf16(x: Tensor<2>, weight: Tensor<2>, bias: Option<Tensor<1>>) -> Tensor<2> {
+    let [x, weight] = [x, weight].map(|operand| operand.cast(DType::BF16));
+    let y = x.matmul(weight.transpose()).cast(DType::F32);
     match bias {
         Some(bias) => y + bias.unsqueeze(),
         None => y,
@@ -165,8 +174,8 @@ fn along(x: Tensor<3>, steps: &[Step]) -> Tensor<3> {
     lower + pick(|step| step.upper) * weights
 }
 
-pub fn sum_of_squares(x: Tensor<1>) -> f64 {
-    x.square().sum().into_scalar::<f64>()
+pub fn sum_of_squares(x: Tensor<1>) -> Tensor<1> {
+    x.square().sum()
 }
 
 pub fn adamw(
@@ -174,9 +183,10 @@ pub fn adamw(
     gradient: Tensor<1>,
     mean: Tensor<1>,
     square: Tensor<1>,
+    scale: f64,
     step: AdamWStep,
 ) -> (Tensor<1>, Tensor<1>, Tensor<1>) {
-    let gradient = gradient * step.gradient_scale;
+    let gradient = gradient * scale;
     let [beta1, beta2] = step.betas;
     let mean = mean * beta1 + gradient.clone() * (1.0 - beta1);
     let square = square * beta2 + gradient.square() * (1.0 - beta2);

@@ -24,17 +24,14 @@ pub fn adamw(
     gradient: Tensor<1>,
     mean: Tensor<1>,
     square: Tensor<1>,
+    scale: f64,
     step: AdamWStep,
 ) -> (Tensor<1>, Tensor<1>, Tensor<1>) {
     let [mut values, mut mean, mut square] = [values, mean, square].map(host);
     let gradient = Array::dense(&host(gradient));
     let [beta1, beta2] = step.betas.map(|beta| beta as f32);
     let [learn1, learn2] = step.betas.map(|beta| (1.0 - beta) as f32);
-    let (scale, epsilon, keep) = (
-        step.gradient_scale as f32,
-        step.epsilon as f32,
-        (1.0 - step.decay) as f32,
-    );
+    let (scale, epsilon, keep) = (scale as f32, step.epsilon as f32, (1.0 - step.decay) as f32);
     let (rate, correction) = (step.rate as f32, step.square_correction as f32);
     values
         .storage_mut::<f32>()

@@ -229,8 +229,8 @@ mod tests {
 
     use super::super::{self as ops, unfused};
     use super::*;
-    use crate::engine::Segment;
     use crate::engine::parameters::to_host;
+    use crate::engine::{Precision, Segment};
 
     fn wave(shape: [usize; 2], phase: f32) -> Tensor<2> {
         let length = shape[0] * shape[1];
@@ -519,6 +519,7 @@ mod tests {
                 vec![wave([37, 12], 0.0), wave([101, 12], 1.0)],
                 |x| {
                     row(ops::tied_cross_entropy(
+                        Precision::F32,
                         x[0].clone(),
                         x[1].clone(),
                         &targets(37, 101),
