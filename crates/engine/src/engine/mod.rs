@@ -38,21 +38,14 @@ pub use weights::{HostTensor, Values, Weights};
 pub enum EngineError {
     /// The device asked for is none of this machine, or this program was built without its kind.
     #[error("there is no device `{device}`: {hint}")]
-<<<<<<< HEAD
     NoSuchDevice {
         /// Kind and number: `cuda:0`, `vulkan:1`.
         device: String,
         /// What is lacking, and what works or helps instead.
         hint: &'static str,
     },
-    /// A precision is asked for in which no operation computes.
-    #[error(
-        "precision `{precision}` is not available on `{device}`: no operation computes in it yet; use `f32`"
-    )]
-=======
-    NoSuchDevice { device: String, hint: &'static str },
+    /// The device cannot compute products in the precision asked for.
     #[error("the device `{device}` does not compute in `{precision}`; use `precision: f32`")]
->>>>>>> main
     Precision {
         /// As it is written in settings.
         precision: &'static str,

@@ -358,11 +358,9 @@ impl Norm {
 /// The scalars of one AdamW step of one parameter, bias corrections included.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AdamWStep {
-    /// Gradients are multiplied by this first (clipping).
-    pub gradient_scale: f64,
-    /// How much of the running mean and of the running mean square is kept, each in `[0, 1)`.
     /// Gradients are brought down to this norm first.
     pub clip: Option<f64>,
+    /// How much of the running mean and of the running mean square is kept, each in `[0, 1)`.
     pub betas: [f64; 2],
     /// Added to the root of the corrected mean square.
     pub epsilon: f64,
