@@ -58,6 +58,7 @@ pub struct TrainMgetSettings {
     pub device: DeviceChoice,
     /// Precision of matrix products; weights, norms and losses are always f32.
     pub precision: Precision,
+    /// How long, in what batches and with what learning rate to train, and when to validate and to checkpoint.
     #[serde(flatten)]
     pub training: TrainingSettings,
 }
