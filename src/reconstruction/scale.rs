@@ -112,24 +112,48 @@ impl DepthFit {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, thiserror::Error)]
 #[serde(rename_all = "snake_case", tag = "reason")]
 pub enum ScaleRefusal {
+    /// There is no body track, which the floor fit needs.
     #[error("no body in the reconstruction, so no feet to stand on")]
     NoBody,
+    /// There is no camera track, which the floor fit needs.
     #[error("no camera path in the reconstruction, so no rays to the floor")]
     NoCamera,
+    /// Fewer than two heights of foot joints are finite.
     #[error("only {found} foot samples, at least 2 are needed")]
-    NoFeet { found: usize },
+    NoFeet {
+        /// Finite heights of foot joints.
+        found: usize,
+    },
+    /// Fewer than 100 depth values can be used for the fit.
     #[error("only {found} depth points, at least 100 are needed")]
-    TooFewPoints { found: usize },
+    TooFewPoints {
+        /// Depth values that can be used.
+        found: usize,
+    },
+    /// A ray to one of the points that are taken for floor is level or rises.
     #[error("the lowest points do not lie below the camera: no floor in view")]
     NotBelow,
+    /// The depths do not determine a scale: all are 0 (floor fit) or equal (anchor).
     #[error("the fit has no unique solution: all depths or all rays are equal")]
     Degenerate,
+    /// The fitted scale is 0, negative or not finite.
     #[error("the fitted scale {scale:.4} is not positive")]
-    NotPositive { scale: f64 },
+    NotPositive {
+        /// The fitted scale, metres per unit of depth.
+        scale: f64,
+    },
+    /// The residual is above [`FloorFit::max_residual`].
     #[error("the lowest points are {residual:.2} m (RMS) from any floor: no floor in view")]
-    NoFloor { residual: f64 },
+    NoFloor {
+        /// Root mean square of the residual heights, metres.
+        residual: f64,
+    },
+    /// The share of outliers is above [`FloorFit::max_outliers`].
     #[error("{:.0} % of the lowest points are not on the fitted floor", share * 100.0)]
-    Outliers { share: f64 },
+    Outliers {
+        /// Share of the points that are taken for floor, 0 to 1.
+        share: f64,
+    },
 }
 
 /// Height of the floor from foot joints of both feet and all samples, metres.
