@@ -47,6 +47,7 @@
 #![recursion_limit = "256"]
 // Transforms are named `T_to_from`, tensors carry shape suffixes (`x_BND`): the field's own notation.
 #![allow(non_snake_case)]
+#![warn(missing_docs)]
 
 pub mod cli;
 pub mod ops;

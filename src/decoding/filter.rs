@@ -14,6 +14,7 @@ pub struct Filter {
     pub top_p: f64,
     /// 0 takes the most likely token.
     pub temperature: f64,
+    /// How one of the tokens that stay is taken.
     pub sampling: Sampling,
 }
 
@@ -21,6 +22,7 @@ pub struct Filter {
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum TopK {
+    /// All tokens stay.
     #[default]
     Off,
     /// This many.

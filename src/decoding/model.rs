@@ -27,7 +27,12 @@ pub struct Sample<'a> {
 #[derive(Debug, Clone)]
 pub enum Slot<'a> {
     /// `ids[p]` counts where `known[p]`.
-    Tokens { ids: Vec<u32>, known: Vec<bool> },
+    Tokens {
+        /// One id per token, in the order of positions; any where the token is not known.
+        ids: Vec<u32>,
+        /// Per token: whether its id is given.
+        known: Vec<bool>,
+    },
     /// Raw video, or [`Content::Absent`].
     Pixels(Content<'a>),
 }
@@ -120,29 +125,61 @@ pub trait TokenModel {
 /// Why tokens cannot be generated.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum DecodingError {
+    /// A target is not among the modalities of the model.
     #[error("the model has no modality `{name}`; it has {known:?}")]
-    UnknownModality { name: String, known: Vec<String> },
+    UnknownModality {
+        /// The modality that was asked for.
+        name: String,
+        /// The model's modalities, in its order.
+        known: Vec<String>,
+    },
+    /// A target is raw video, which has no vocabulary.
     #[error("`{name}` can only be an input, never generated")]
-    NotPredicted { name: String },
+    NotPredicted {
+        /// The target.
+        name: String,
+    },
+    /// A sample does not have one slot per modality of the model.
     #[error("sample {sample}: {found} slots for {expected} modalities")]
     Slots {
+        /// Index of the sample in the batch.
         sample: usize,
+        /// Slots of the sample.
         found: usize,
+        /// Modalities of the model.
         expected: usize,
     },
+    /// Samples of one batch have different numbers of unknown tokens of a target.
     #[error("`{name}`: samples of one batch have {a} and {b} open tokens; generate them apart")]
-    Uneven { name: String, a: usize, b: usize },
+    Uneven {
+        /// The target.
+        name: String,
+        /// Unknown tokens of the first sample.
+        a: usize,
+        /// Unknown tokens of the sample that differs from it.
+        b: usize,
+    },
+    /// A slot does not hold one id and one mark per token of its modality.
     #[error("sample {sample}, `{name}`: {found} tokens, expected {expected}")]
     Length {
+        /// Index of the sample in the batch.
         sample: usize,
+        /// The modality.
         name: String,
+        /// Ids in the slot.
         found: usize,
+        /// Tokens per sample of the modality.
         expected: usize,
     },
+    /// A logit is NaN.
     #[error(
         "the model answers with a value that is not a number for `{name}`; its weights are broken"
     )]
-    NotFinite { name: String },
+    NotFinite {
+        /// The modality that was being decoded.
+        name: String,
+    },
+    /// The model refuses a sample, a position or a range of rows: its reason.
     #[error("{0}")]
     Model(String),
 }

@@ -54,6 +54,7 @@ pub struct TargetSettings {
     pub top_p: f64,
     /// How many of the most likely tokens stay.
     pub top_k: TopK,
+    /// How one of the tokens that stay is taken.
     pub sampling: Sampling,
 }
 
@@ -115,6 +116,7 @@ pub struct TargetChanges {
     /// How many of the most likely tokens stay.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub top_k: Option<TopK>,
+    /// How one of the tokens that stay is taken.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub sampling: Option<Sampling>,
     /// How many of the samples are decoded for the mean; fewer for video, whose decoding takes longest.

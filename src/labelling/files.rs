@@ -54,6 +54,7 @@ pub struct DepthFiles {
 /// What was written.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Written {
+    /// How many frames.
     pub frames: usize,
     /// The smallest and the largest value.
     pub range: [f32; 2],

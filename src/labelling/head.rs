@@ -13,7 +13,9 @@ use crate::engine::{Initialise, Parameter, parameters};
 /// Maps of several frames: `[frames * height * width, C]`.
 #[derive(Debug, Clone)]
 pub struct Maps {
+    /// One per pixel, row-major within a frame: `[frames * height * width, C]`.
     pub rows: Tensor<2>,
+    /// How many frames.
     pub frames: usize,
     /// Height and width.
     pub size: [usize; 2],

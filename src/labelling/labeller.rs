@@ -38,13 +38,16 @@ pub struct DepthLabeller {
 /// What a video was labelled as.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Labelled {
+    /// Frames of the video.
     pub frames: usize,
+    /// Windows that the network saw.
     pub windows: usize,
     /// Height and width that the network saw.
     pub network_size: [usize; 2],
 }
 
 impl DepthLabeller {
+    /// A labeller with a network whose weights are of `kind`; `compute` is where the frames are sent.
     #[must_use]
     pub fn new(network: DepthNetwork, kind: DepthLabelKind, compute: &Compute) -> Self {
         Self {
@@ -54,11 +57,13 @@ impl DepthLabeller {
         }
     }
 
+    /// What the weights give: relative inverse depth or metres.
     #[must_use]
     pub fn kind(&self) -> DepthLabelKind {
         self.kind
     }
 
+    /// The network that labels.
     #[must_use]
     pub fn network(&self) -> &DepthNetwork {
         &self.network

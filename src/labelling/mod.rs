@@ -31,13 +31,16 @@ pub use stitch::{Map, Stitcher};
 /// Why depth cannot be labelled.
 #[derive(Debug, thiserror::Error)]
 pub enum LabelError {
+    /// The network's folder, sizes or kind of weights cannot be used.
     #[error("depth network: {0}")]
     Settings(String),
+    /// The video has no frames, or they are empty, too narrow or of different sizes.
     #[error("{0}")]
     Frames(String),
     /// Something cannot be read or written.
     #[error("{0}")]
     Files(String),
+    /// The weights cannot be read, written or put into the network.
     #[error(transparent)]
     Engine(#[from] crate::engine::EngineError),
 }

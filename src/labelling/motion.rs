@@ -115,15 +115,23 @@ impl Attention {
 /// What every step of a module gives, on rows frame by frame. For comparisons with the reference.
 #[derive(Debug)]
 pub struct Steps {
+    /// The input after the group norm, `[N, C]`.
     pub group_norm: Tensor<2>,
+    /// After the first linear layer, `[N, C]`.
     pub proj_in: Tensor<2>,
     /// Per attention layer: its norm, and its output before it is added.
     pub attention: Vec<[Tensor<2>; 2]>,
+    /// The layer norm before the feed-forward part, `[N, C]`.
     pub ff_norm: Tensor<2>,
+    /// The gated hidden layer of the feed-forward part, `[N, 4 * C]`.
     pub geglu: Tensor<2>,
+    /// The output of the feed-forward part before it is added, `[N, C]`.
     pub ff: Tensor<2>,
+    /// The output of the transformer block, `[N, C]`.
     pub block: Tensor<2>,
+    /// After the last linear layer, before the module's input is added, `[N, C]`.
     pub proj_out: Tensor<2>,
+    /// The output of the module, `[N, C]`.
     pub y: Tensor<2>,
 }
 

@@ -45,16 +45,19 @@ impl DepthNetwork {
         })
     }
 
+    /// The sizes it was built with.
     #[must_use]
     pub fn settings(&self) -> &NetworkSettings {
         &self.settings
     }
 
+    /// The image encoder, which sees each frame alone.
     #[must_use]
     pub fn encoder(&self) -> &Encoder {
         &self.encoder
     }
 
+    /// The head, which mixes the frames of a window.
     #[must_use]
     pub fn head(&self) -> &Head {
         &self.head

@@ -55,8 +55,11 @@ pub struct NetworkSettings {
     pub grid: usize,
     /// Width, blocks and heads of the encoder, and the width inside its MLP.
     pub width: usize,
+    /// Transformer blocks of the encoder.
     pub blocks: usize,
+    /// Attention heads of every block of the encoder; they divide `width`.
     pub heads: usize,
+    /// Width inside the MLP of every block of the encoder.
     pub hidden: usize,
     /// The blocks whose outputs the head sees.
     pub taps: [usize; 4],

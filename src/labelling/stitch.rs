@@ -70,11 +70,14 @@ impl Aligned {
 /// `max(scale * value + shift, 0)`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Fit {
+    /// Factor of a window's values.
     pub scale: f64,
+    /// Added to the scaled values, in the unit of the depth that is fitted to.
     pub shift: f64,
 }
 
 impl Fit {
+    /// Scale 1 and shift 0; maps are then taken as they are.
     pub const IDENTITY: Self = Self {
         scale: 1.0,
         shift: 0.0,
@@ -125,6 +128,7 @@ pub struct Stitcher {
 }
 
 impl Stitcher {
+    /// The start of a video of `size` (height, width); only windows of relative depth are fitted to each other.
     #[must_use]
     pub fn new(kind: DepthLabelKind, size: [usize; 2]) -> Self {
         Self {

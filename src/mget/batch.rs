@@ -110,25 +110,42 @@ pub struct Batch {
 /// Why a sample does not fit a model.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum BatchError {
+    /// A modality does not have as many ids or values as the grid or the clip of the spec.
     #[error("sample {sample}, {modality}: {found} values, expected {expected}")]
     Length {
+        /// Index of the sample in the batch.
         sample: usize,
+        /// The modality's name in the spec.
         modality: String,
+        /// Ids of the modality, or values of its clip.
         found: usize,
+        /// How many the spec asks for.
         expected: usize,
     },
+    /// A token's id is not below the vocabulary.
     #[error(
         "sample {sample}, {modality}: token {token} at position {position} is outside the vocabulary of {vocabulary}"
     )]
     Vocabulary {
+        /// Index of the sample in the batch.
         sample: usize,
+        /// The modality's name in the spec.
         modality: String,
+        /// Position of the token within its modality.
         position: usize,
+        /// The token's id.
         token: u32,
+        /// How many different tokens the modality has.
         vocabulary: usize,
     },
+    /// A mask uses a modality that the sample lacks or holds in another form, or a position beyond its grid.
     #[error("sample {sample}, {modality}: a mask uses positions the sample does not have")]
-    Absent { sample: usize, modality: String },
+    Absent {
+        /// Index of the sample in the batch.
+        sample: usize,
+        /// The modality's name in the spec.
+        modality: String,
+    },
 }
 
 impl Batch {

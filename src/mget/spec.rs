@@ -67,48 +67,87 @@ fn product(sizes: &[usize]) -> Option<usize> {
 /// Why a model cannot be built.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum SpecError {
+    /// The width does not split evenly over the attention heads.
     #[error("width {width} is not divisible by {heads} heads")]
-    Heads { width: usize, heads: usize },
+    Heads {
+        /// Width of the model.
+        width: usize,
+        /// Attention heads of every block.
+        heads: usize,
+    },
+    /// The width does not suit the position code of a modality's grid.
     #[error(
         "width {width} is not divisible by {divisor}, which the position code of `{modality}` ({axes} axes) needs; divisible by 12 always works"
     )]
     Width {
+        /// Width of the model.
         width: usize,
+        /// What the width must be a multiple of for this grid: 2, 4 or 6.
         divisor: usize,
+        /// The modality's name.
         modality: String,
+        /// Axes of the modality's grid, 1 to 3.
         axes: usize,
     },
+    /// A grid has a number of axes for which there is no position code.
     #[error(
         "`{modality}` has a grid of {axes} axes; position codes exist for 1 (time), 2 (time, joints) and 3 (video)"
     )]
-    Axes { modality: String, axes: usize },
+    Axes {
+        /// The modality's name.
+        modality: String,
+        /// Axes of its grid.
+        axes: usize,
+    },
+    /// A clip does not divide into whole tubelets, or a side of the tubelet is 0.
     #[error("`{modality}`: clip {clip:?} is not divisible into tubelets of {tubelet:?}")]
     Tubelet {
+        /// The modality's name.
         modality: String,
+        /// Frames, height, width and channels of the clip.
         clip: [usize; 4],
+        /// Frames, height and width of a tubelet.
         tubelet: [usize; 3],
     },
+    /// The vocabulary or a side of the grid is 0.
     #[error("`{modality}` has an empty {what}")]
     Empty {
+        /// The modality's name.
         modality: String,
+        /// `vocabulary` or `grid`.
         what: &'static str,
     },
+    /// A sample has more tokens or tubelets of a modality than a model can have.
     #[error("`{modality}`: {sizes:?} is too large, a sample has at most {MOST_TOKENS} tokens")]
-    TooMany { modality: String, sizes: Vec<usize> },
+    TooMany {
+        /// The modality's name.
+        modality: String,
+        /// The grid of tokens, or frames, height, width and channels of the clip.
+        sizes: Vec<usize>,
+    },
+    /// Two modalities have this name.
     #[error("modality `{0}` appears twice")]
     Twice(String),
+    /// A modality has this name, which cannot stand in the name of a parameter.
     #[error("modality name `{0}` is empty or holds a dot or a blank")]
     Name(String),
+    /// All modalities are raw video, or there are none.
     #[error("no modality has tokens: there is nothing to predict")]
     NothingToPredict,
+    /// The width, the number of heads or a depth of this size is 0.
     #[error("the model's size has a zero: {0:?}")]
     ZeroSize(Size),
+    /// A width or a depth of this size is above its limit.
     #[error(
         "the model's size is out of range, widths to {MOST_WIDTH} and depths to {MOST_DEPTH}: {0:?}"
     )]
     HugeSize(Size),
+    /// There are no position codes for a modality's grid at the width of the model.
     #[error("`{modality}` has no position table of this width")]
-    NoTable { modality: String },
+    NoTable {
+        /// The modality's name.
+        modality: String,
+    },
 }
 
 impl ModalitySpec {

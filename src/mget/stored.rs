@@ -15,16 +15,32 @@ const MAX_SPEC: u64 = 1 << 20;
 /// Why a model cannot be read or written.
 #[derive(Debug, thiserror::Error)]
 pub enum StoredError {
+    /// The file of the spec cannot be read, is too large or does not hold a spec.
     #[error("{path}: {reason}")]
-    File { path: PathBuf, reason: String },
+    File {
+        /// The file of the spec.
+        path: PathBuf,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// The file of the spec cannot be written.
     #[error("{path}: {error}")]
     Write {
+        /// The file of the spec.
         path: PathBuf,
+        /// What the operating system says.
         #[source]
         error: std::io::Error,
     },
+    /// The spec that was read is of no model that can be built.
     #[error("{path}: {error}")]
-    Spec { path: PathBuf, error: SpecError },
+    Spec {
+        /// The file of the spec.
+        path: PathBuf,
+        /// Why the model cannot be built.
+        error: SpecError,
+    },
+    /// The weights cannot be read or written, or do not belong to the spec.
     #[error(transparent)]
     Weights(#[from] EngineError),
 }

@@ -51,12 +51,16 @@ impl Default for EvaluateOptions {
 /// Why a model cannot be scored.
 #[derive(Debug, thiserror::Error)]
 pub enum EvaluateError {
+    /// A clip cannot be read.
     #[error(transparent)]
     Clips(#[from] ReadError),
+    /// The model refuses a clip, or does not know a modality that is asked for.
     #[error(transparent)]
     Model(#[from] ModelError),
+    /// The predictions cannot be scored, or the callback stopped it.
     #[error(transparent)]
     Evaluation(#[from] EvaluationError),
+    /// The scores cannot stand in one table.
     #[error(transparent)]
     Compare(#[from] CompareError),
 }

@@ -59,6 +59,7 @@ pub struct TrainMgetSettings {
     pub device: DeviceChoice,
     /// What operands of matrix products are rounded to; sums, weights, norms and losses are always f32.
     pub precision: Precision,
+    /// How long, in what batches and with what learning rate to train, and when to validate and to checkpoint.
     #[serde(flatten)]
     pub training: TrainingSettings,
 }

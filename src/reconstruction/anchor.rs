@@ -18,19 +18,33 @@ const LARGEST: usize = 8192;
 /// Why an anchor cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum AnchorError {
+    /// A file or a folder of maps cannot be read.
     #[error("{}: {error}", path.display())]
     Io {
+        /// The file or folder.
         path: PathBuf,
+        /// What the operating system says.
         error: std::io::Error,
     },
+    /// The npz archive of maps cannot be read.
     #[error(transparent)]
     Npz(#[from] FormatError),
+    /// What was read holds no depth maps of one size.
     #[error("{}: {reason}", path.display())]
-    Malformed { path: PathBuf, reason: String },
+    Malformed {
+        /// The file or folder.
+        path: PathBuf,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// There are fewer maps than frames, or no frames.
     #[error("{}: {found} depth maps for {expected} frames of the model's video", path.display())]
     Frames {
+        /// The file or folder of maps.
         path: PathBuf,
+        /// Frames of the video at the model's rate.
         expected: usize,
+        /// Maps that were found.
         found: usize,
     },
 }

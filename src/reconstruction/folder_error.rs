@@ -7,16 +7,22 @@ use std::path::{Path, PathBuf};
 /// Why a reconstruction folder cannot be written.
 #[derive(Debug, thiserror::Error)]
 pub enum FolderError {
+    /// A file or a folder cannot be made or written.
     #[error("{path}: {error}")]
     Io {
+        /// The file or folder.
         path: PathBuf,
+        /// What the operating system says.
         #[source]
         error: std::io::Error,
     },
+    /// A file of arrays cannot be written.
     #[error(transparent)]
     Format(#[from] FormatError),
+    /// The page cannot be made, or a video frame cannot be stored for it.
     #[error(transparent)]
     View(#[from] ViewError),
+    /// The manifest cannot be put into JSON.
     #[error("{0}")]
     Manifest(#[from] serde_json::Error),
 }

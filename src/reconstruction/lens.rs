@@ -50,16 +50,25 @@ pub struct Calibration {
 /// Why a camera cannot be used.
 #[derive(Debug, thiserror::Error, PartialEq)]
 pub enum LensError {
+    /// The field of view, in degrees, is out of its range.
     #[error("a field of view of {0} degrees is not between 1 and 170")]
     FieldOfView(f64),
+    /// The calibration is not that of a pinhole camera.
     #[error(
         "the calibration has a focal length that is not positive, or a value that is not finite"
     )]
     Calibration,
+    /// The calibration is for pictures of another aspect ratio, or of width 0.
     #[error(
         "the calibration is for {expected:?} pixels, the video has {found:?}: not the same shape"
     )]
-    Shape { expected: [u32; 2], found: [u32; 2] },
+    Shape {
+        /// Width and height that the calibration is for, pixels.
+        expected: [u32; 2],
+        /// Width and height of the video, pixels.
+        found: [u32; 2],
+    },
+    /// `up` gives no direction, or one that leaves the heading of the camera open.
     #[error("`up` is zero, not finite, or along the camera's right axis")]
     Up,
 }

@@ -60,7 +60,10 @@ pub struct SignalNote {
 #[serde(rename_all = "snake_case")]
 pub enum ScaleStatus {
     /// In metres, and why: `learned from metric data`, `floor fit`, `anchor depth`.
-    Metric { by: String },
+    Metric {
+        /// What makes the lengths metric.
+        by: String,
+    },
     /// Up to an unknown scale (and shift, for depth).
     Relative,
     /// Not a length.
@@ -104,12 +107,25 @@ pub const FORMAT: u32 = 1;
 /// Why predictions cannot be read or written.
 #[derive(Debug, thiserror::Error)]
 pub enum PredictionsError {
+    /// The npz file of a clip cannot be read or written.
     #[error(transparent)]
     Format(#[from] FormatError),
+    /// The folder or its index cannot be read or written.
     #[error("{path}: {source}")]
-    Io { path: String, source: io::Error },
+    Io {
+        /// The file or folder.
+        path: String,
+        /// What the operating system says.
+        source: io::Error,
+    },
+    /// The index or the file of a clip is of another form, or there are no predictions.
     #[error("{path}: {reason}")]
-    Content { path: String, reason: String },
+    Content {
+        /// The file or folder.
+        path: String,
+        /// What is wrong with it.
+        reason: String,
+    },
 }
 
 impl PredictionsError {

@@ -71,12 +71,23 @@ pub struct Reconstruction {
 /// Why a value is not known.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum NotKnown {
+    /// The motion that is asked for was not reconstructed.
     #[error("this was not reconstructed")]
     Absent,
+    /// The time lies before the start or after the end, or is NaN.
     #[error("{seconds} s lies outside the recording of {length} s")]
-    Outside { seconds: f64, length: f64 },
+    Outside {
+        /// The time that is asked for, seconds from the start.
+        seconds: f64,
+        /// Length of what was reconstructed, seconds.
+        length: f64,
+    },
+    /// The joint is unknown at a sample next to this time.
     #[error("it is not known at {seconds} s")]
-    Invalid { seconds: f64 },
+    Invalid {
+        /// The time that is asked for, seconds from the start.
+        seconds: f64,
+    },
 }
 
 impl Reconstruction {

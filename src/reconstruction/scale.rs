@@ -80,42 +80,91 @@ impl DepthFit {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, thiserror::Error)]
 #[serde(rename_all = "snake_case", tag = "reason")]
 pub enum ScaleRefusal {
+    /// There is no body track, which the floor fit needs.
     #[error("no body in the reconstruction, so no feet to stand on")]
     NoBody,
+    /// There is no camera track, which the floor fit needs.
     #[error("no camera path in the reconstruction, so no rays to the floor")]
     NoCamera,
+    /// Fewer than two heights of foot joints are finite.
     #[error("only {found} foot samples, at least 2 are needed")]
-    NoFeet { found: usize },
+    NoFeet {
+        /// Finite heights of foot joints.
+        found: usize,
+    },
+    /// Fewer than 100 depth values can be used for the fit.
     #[error("only {found} depth points, at least 100 are needed")]
-    TooFewPoints { found: usize },
+    TooFewPoints {
+        /// Depth values that can be used.
+        found: usize,
+    },
+    /// The pictures have no contrast to measure by.
     #[error("the frames are blank: depth there is the model's guess, not a measurement")]
     Blank,
+    /// Neighbouring pictures do not resemble each other.
     #[error("neighbouring frames have nothing in common: this is noise, not a video of a place")]
     Noise,
+    /// No ray to a point that could be floor goes down.
     #[error("the camera looks nowhere down: no floor in view")]
     NotBelow,
+    /// Too few of all points lie on the best plane.
     #[error("only {:.1} % of the points lie on one floor: no floor in view", support * 100.0)]
-    NoFloor { support: f64 },
+    NoFloor {
+        /// Share of the whole cloud that lies on the fitted floor, 0 to 1.
+        support: f64,
+    },
+    /// Too many of the lowest points are off the fitted floor.
     #[error("{:.0} % of the lowest points are not on the fitted floor", share * 100.0)]
-    Outliers { share: f64 },
+    Outliers {
+        /// Share of the points that are taken for floor, 0 to 1.
+        share: f64,
+    },
+    /// Depth varies too little over the floor to tell scale from shift.
     #[error("depth does not say its scale: it spreads by {:.0} % where it was fitted, with a residual of {:.0} %", spread * 100.0, residual * 100.0)]
-    Degenerate { spread: f64, residual: f64 },
+    Degenerate {
+        /// Spread of the depths that were fitted, relative to their mean.
+        spread: f64,
+        /// Residual of the fit, relative to depth.
+        residual: f64,
+    },
+    /// The fitted scale is 0, negative or not finite.
     #[error("the fitted scale {scale:.4} is not positive")]
-    NotPositive { scale: f64 },
+    NotPositive {
+        /// Metres per unit of depth.
+        scale: f64,
+    },
+    /// Scale or shift is further from the identity than any plausible depth model is.
     #[error(
         "the fit would make depth {factor:.2} times what it was with a shift of {shift:.2}: that is no floor"
     )]
-    Bounds { factor: f64, shift: f64 },
+    Bounds {
+        /// What depth would be multiplied by.
+        factor: f64,
+        /// What would be added.
+        shift: f64,
+    },
+    /// Parts of the video, fitted alone, disagree with the whole.
     #[error("seconds of the video fitted alone are {:.0} % from the whole", apart * 100.0)]
-    Windows { apart: f64 },
+    Windows {
+        /// How far they are apart, relative to the scale.
+        apart: f64,
+    },
+    /// The wearer's hands, whose distance is known, disagree with the fit.
     #[error(
         "at the hands the fitted depth is {factor:.2} times that of the hands: what was fitted is not the floor"
     )]
-    Hands { factor: f64 },
+    Hands {
+        /// Fitted depth over the hands' own.
+        factor: f64,
+    },
+    /// The parallax of the camera's own path disagrees with the fit.
     #[error(
         "the camera's path fits depth {factor:.2} times as large as the floor does: what was fitted is not the floor"
     )]
-    Parallax { factor: f64 },
+    Parallax {
+        /// Depth by parallax over depth by the floor.
+        factor: f64,
+    },
 }
 
 /// Fits depth to a metric depth of another model over pairs `(depth, metric)` with a positive finite metric.

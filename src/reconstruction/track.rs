@@ -39,6 +39,7 @@ pub trait Track: Any + Debug + Send + Sync {
 /// Where a window lies.
 #[derive(Debug)]
 pub struct Placement<'a> {
+    /// The window, in motion samples at 30 Hz from the start of the video.
     pub window: &'a Window,
     /// World pose of the window's first camera, as far as the camera's own track says it; that comes first.
     pub T_world_first: Rigid,
@@ -49,6 +50,7 @@ pub struct Placement<'a> {
 pub struct Gap {
     /// The quantity and its unit: `body_m`. Distances of several tracks under one name are averaged together.
     pub name: String,
+    /// In the unit of the name, one per shared sample, of body and hands one per joint.
     pub distances: Vec<f64>,
 }
 
@@ -74,6 +76,7 @@ pub struct Timeline<'a> {
 /// What a modality is, for a track that writes and draws it.
 #[derive(Debug, Clone, Default)]
 pub struct Description {
+    /// The modality's name.
     pub modality: String,
     /// One name per channel; empty where they have none.
     pub channels: Vec<String>,
@@ -83,6 +86,7 @@ pub struct Description {
     pub frame: String,
     /// Samples per second.
     pub rate: Option<f64>,
+    /// Whether its lengths are metric, and by what; `None` is written as not a length.
     pub scale: Option<ScaleStatus>,
 }
 
@@ -102,7 +106,9 @@ impl Description {
 
 /// A track that is linked in.
 pub struct TrackEntry {
+    /// The name of the modality that it is the track of.
     pub modality: &'static str,
+    /// Makes an empty track of the modality that is described.
     pub make: fn(&Description) -> Box<dyn Track>,
 }
 inventory::collect!(TrackEntry);

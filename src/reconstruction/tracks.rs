@@ -34,6 +34,7 @@ fn learned() -> ScaleStatus {
 /// The path of the camera, `T_world_camera`; the world has z up.
 #[derive(Debug, Default)]
 pub struct CameraPath {
+    /// One per motion sample at 30 Hz, metres.
     pub poses: Vec<Rigid>,
 }
 inventory::submit! { TrackEntry { modality: "camera", make: |_| Box::new(CameraPath::default()) } }
@@ -120,6 +121,7 @@ impl Track for CameraPath {
 /// Where the wearer looks, upright square image, `[0, 1]^2`; NaN where invalid.
 #[derive(Debug, Default)]
 pub struct GazePath {
+    /// One per motion sample at 30 Hz.
     pub points: Vec<[f32; 2]>,
 }
 inventory::submit! { TrackEntry { modality: "gaze", make: |_| Box::new(GazePath::default()) } }
@@ -163,6 +165,7 @@ impl Track for GazePath {
 #[derive(Debug)]
 pub struct JointPath {
     part: &'static JointPart,
+    /// One per motion sample at 30 Hz: all joints in metres, NaN where unknown.
     pub poses: Vec<Joints>,
 }
 
@@ -320,6 +323,7 @@ pub fn gravity_to_world(T_world_camera: &Rigid) -> Rigid {
 /// Channels over time, blended linearly: a modality that brings no track of its own.
 #[derive(Debug)]
 pub struct SignalTrack {
+    /// What the modality says of itself.
     pub description: Description,
     /// Samples per second.
     pub rate: f64,

@@ -38,10 +38,15 @@ impl Window {
 /// Why a video cannot be cut into windows.
 #[derive(Debug, thiserror::Error, PartialEq)]
 pub enum WindowError {
+    /// The length of the video is not finite or not above 0.
     #[error("the video has no frame")]
     Empty,
+    /// The overlap of neighbouring windows is none of those that the grid of half seconds has.
     #[error("an overlap of {found} s is not 0.5, 1 or 1.5 s")]
-    Overlap { found: f64 },
+    Overlap {
+        /// The overlap that is asked for, seconds.
+        found: f64,
+    },
 }
 
 /// Motion samples in a video of `seconds`: those whose time lies before its end, at least one.

@@ -78,26 +78,41 @@ fn check_tokens(tokenizer: &dyn Tokenizer, tokens: &[TokenGrid]) -> Result<(), T
 /// Why a tokenizer refuses its input.
 #[derive(Debug, thiserror::Error)]
 pub enum TokenizerError {
+    /// A signal, its validity or a token grid has another shape than the tokenizer was built for.
     #[error("{modality}: signal {index} has shape {found:?}, expected {expected:?}")]
     Shape {
+        /// The modality of the tokenizer.
         modality: String,
+        /// Index of the signal or grid in the batch.
         index: usize,
+        /// Its shape.
         found: Vec<usize>,
+        /// The shape that the tokenizer takes.
         expected: Vec<usize>,
     },
+    /// A value is NaN or infinite and not marked as invalid.
     #[error("{modality}: signal {index} holds a value that is not finite at {position:?}")]
     NotFinite {
+        /// The modality of the tokenizer.
         modality: String,
+        /// Index of the signal in the batch.
         index: usize,
+        /// Index of the value along every axis of the signal.
         position: Vec<usize>,
     },
+    /// A token's id is not below the vocabulary.
     #[error("{modality}: token {token} of grid {index} is outside the vocabulary of {vocabulary}")]
     Vocabulary {
+        /// The modality of the tokenizer.
         modality: String,
+        /// Index of the token grid in the batch.
         index: usize,
+        /// The token's id.
         token: u32,
+        /// How many different tokens the tokenizer has.
         vocabulary: usize,
     },
+    /// A tokenizer cannot be built, fitted, read or written, for this reason.
     #[error("{0}")]
     Other(String),
 }

@@ -16,7 +16,12 @@ pub enum Shape {
     Constant,
     /// `sqrt(timescale / (timescale + i))` with a `timescale` above 0, then a linear cool-down to the final rate, which is
     /// reached.
-    InverseSqrt { timescale: u64, cooldown_steps: u64 },
+    InverseSqrt {
+        /// Steps after the warm-up at which the rate has fallen to `1 / sqrt(2)` of the peak; above 0.
+        timescale: u64,
+        /// Steps of the cool-down, the last ones of the run.
+        cooldown_steps: u64,
+    },
 }
 
 /// A learning rate for each of `total` steps.

@@ -115,12 +115,16 @@ pub struct DatasetSize {
 /// Why training settings cannot be used.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum SettingsError {
+    /// The length of the run is given more than once or not at all.
     #[error("give exactly one of `steps`, `epochs` and `total_tokens`")]
     Length,
+    /// The setting of this name is 0 where it must not be, negative or not finite.
     #[error("`{0}` must be a positive, finite number")]
     Positive(&'static str),
+    /// The setting of this name has a value it cannot have.
     #[error("`{0}` is out of its range")]
     Range(String),
+    /// Warm-up and cool-down are longer than the run.
     #[error(transparent)]
     Schedule(#[from] ScheduleError),
 }

@@ -37,45 +37,72 @@ pub trait TokenSource: Send + Sync {
 /// Why a sample cannot be used.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum DataError {
+    /// A shard or a clip in it cannot be read.
     #[error(
         "shard {shard} cannot be read: {reason}; the run continues from its last checkpoint once it is back"
     )]
-    Shard { shard: String, reason: String },
+    Shard {
+        /// The path of the shard, or the name of a data set that is held in memory.
+        shard: String,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// A token's id is not below the vocabulary.
     #[error(
         "shard {shard}, sample `{sample}`, {modality}: token {token} is outside the vocabulary of {vocabulary}"
     )]
     Vocabulary {
+        /// The shard of the modality, or `in memory`.
         shard: String,
+        /// The clip's name.
         sample: String,
+        /// The modality's name.
         modality: String,
+        /// The token's id.
         token: u32,
+        /// How many different tokens the model has for the modality.
         vocabulary: usize,
     },
+    /// A modality has another number of tokens or tubelets than the model.
     #[error(
         "shard {shard}, sample `{sample}`, {modality}: {found} values, the model expects {expected}"
     )]
     Length {
+        /// The shard of the modality, or `in memory`.
         shard: String,
+        /// The clip's name.
         sample: String,
+        /// The modality's name.
         modality: String,
+        /// Tokens or tubelets of the clip.
         found: usize,
+        /// Tokens or tubelets that the model takes.
         expected: usize,
     },
+    /// The shards of a modality hold two clips of one name.
     #[error(
         "{modality}: clip `{clip}` is in shard {first} and in shard {second}; the clips of one folder need names of their own"
     )]
     Twice {
+        /// The modality's name.
         modality: String,
+        /// The name that both clips have.
         clip: String,
+        /// Path of the shard that was read first.
         first: String,
+        /// Path of the shard that repeats the name.
         second: String,
     },
+    /// The data set of this name has no clips.
     #[error("data set `{0}` has no clips")]
     Empty(String),
+    /// A weight is negative or not finite, all are 0, or there is not one per data set.
     #[error("the weights of the data sets are not finite and positive")]
     Weights,
+    /// A sample does not fit the model or its mask.
     #[error("a batch could not be packed: {0}")]
     Batch(#[from] crate::mget::BatchError),
+    /// A loader thread ended before the batch that was due.
     #[error("a loader thread has stopped")]
     Stopped,
 }

@@ -168,44 +168,79 @@ struct Best {
 pub enum TrainingError {
     /// Steps are counted from 1.
     #[error("the loss of step {step} is {loss}; nothing was changed, the last checkpoint is good")]
-    Loss { step: u64, loss: f64 },
+    Loss {
+        /// The step that was not taken.
+        step: u64,
+        /// The loss of one of its micro-batches, NaN or infinite.
+        loss: f64,
+    },
+    /// The gradient of a step is not finite; the step was not taken.
     #[error("{0}; nothing was changed, the last checkpoint is good")]
     Gradient(#[from] NotFinite),
+    /// No clip has a signal to train on.
     #[error("there is nothing to train on")]
     NoData,
+    /// The callback asked to stop.
     #[error("stopped by its callback")]
     Stopped,
+    /// A rank of the job has ended, or does not answer.
     #[error(transparent)]
     Rank(#[from] RankError),
+    /// The batch does not divide over the ranks.
     #[error(transparent)]
     Share(#[from] ShareError),
+    /// The format of the clips has no modality of this name.
     #[error("the clips have no modality `{0}`")]
     UnknownModality(String),
+    /// A signal of a clip cannot be taken, or cannot be used.
     #[error("clip `{clip}`: {reason}")]
-    Clip { clip: String, reason: String },
+    Clip {
+        /// The id of the clip.
+        clip: String,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// The settings of the training cannot be used.
     #[error(transparent)]
     Settings(#[from] SettingsError),
+    /// The model to be trained cannot be built.
     #[error(transparent)]
     Spec(#[from] SpecError),
+    /// The settings of the masking cannot be used.
     #[error(transparent)]
     Masking(#[from] MaskingError),
+    /// A model cannot be put together, or its tokenizers refuse a clip.
     #[error(transparent)]
     Model(#[from] ModelError),
+    /// A training sample cannot be read, or does not fit the model.
     #[error(transparent)]
     Data(#[from] DataError),
+    /// A clip cannot be read.
     #[error(transparent)]
     Clips(#[from] ReadError),
+    /// A tokenizer cannot be built or fitted, or refuses a signal.
     #[error(transparent)]
     Tokenizer(#[from] TokenizerError),
+    /// Warm-up and cool-down are longer than the run.
     #[error(transparent)]
     Schedule(#[from] ScheduleError),
+    /// Weights or the state of the optimizer cannot be read, written or taken over.
     #[error(transparent)]
     Engine(#[from] EngineError),
+    /// A file of a checkpoint is missing, damaged or of another form.
     #[error("{path}: {reason}")]
-    Checkpoint { path: PathBuf, reason: String },
+    Checkpoint {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// The progress of a checkpoint cannot be written.
     #[error("{path}: {error}")]
     Write {
+        /// The file of the progress.
         path: PathBuf,
+        /// What the operating system says.
         #[source]
         error: std::io::Error,
     },

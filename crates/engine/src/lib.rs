@@ -4,6 +4,7 @@
 #![recursion_limit = "256"]
 // Tensors carry shape suffixes (`x_BND`): the field's own notation.
 #![allow(non_snake_case)]
+#![warn(missing_docs)]
 
 pub mod engine;
 pub mod nn;

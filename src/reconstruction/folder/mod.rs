@@ -44,24 +44,32 @@ const POINTS: usize = 2_000_000;
 /// What `manifest.json` of the folder holds.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Manifest {
+    /// The name of the recording.
     pub title: String,
     /// Label and value: what was assumed.
     pub assumptions: Vec<[String; 2]>,
     /// Where in the video it starts.
     #[serde(default)]
     pub start_seconds: f64,
+    /// Length of the recording, seconds.
     pub seconds: f64,
+    /// Of the square frames that the model saw, pixels.
     pub intrinsics: Intrinsics,
+    /// Whether depth is metric, and by what.
     pub scale: ScaleStatus,
     /// The fit that made depth metric.
     pub fit: Option<DepthFit>,
     /// Why depth stayed relative.
     pub refused: Option<String>,
+    /// What the arrays in the folder's files are.
     pub arrays: Vec<ArrayFacts>,
+    /// How well neighbouring windows agree, in the order of time.
     pub seams: Vec<WindowBoundary>,
+    /// How the depth of each window was brought to the scale of the one before it.
     pub depth_seams: Vec<DepthSeam>,
     /// Mean confidence by modality: from token entropies, 0 (a guess) to 1 (certain). Not an accuracy.
     pub confidence: BTreeMap<String, f64>,
+    /// The files of the folder, this one included, relative to it and sorted.
     pub files: Vec<String>,
 }
 

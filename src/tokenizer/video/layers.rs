@@ -183,6 +183,7 @@ parameters!(ResBlock {
 });
 
 impl ResBlock {
+    /// A block from `inputs` to `outputs` channels.
     #[must_use]
     pub fn new(init: &Initialise<'_>, inputs: usize, outputs: usize) -> Self {
         Self {
@@ -195,6 +196,7 @@ impl ResBlock {
         }
     }
 
+    /// `[N, inputs]` to `[N, outputs]`.
     #[must_use]
     pub fn forward(&self, x_NC: Tensor<2>, extent: Extent) -> Tensor<2> {
         let h_NC = self.norm1.forward(x_NC.clone(), extent, true);
@@ -238,6 +240,7 @@ parameters!(Attention {
 });
 
 impl Attention {
+    /// Attention over `channels` channels.
     #[must_use]
     pub fn new(init: &Initialise<'_>, channels: usize, attends: Attends) -> Self {
         let conv = |name: &str| Conv::new(&init.at(name), channels, channels, Kernel::Point);
@@ -251,6 +254,7 @@ impl Attention {
         }
     }
 
+    /// `[N, C]` to `[N, C]`.
     #[must_use]
     pub fn forward(&self, x_NC: Tensor<2>, extent: Extent) -> Tensor<2> {
         let h_NC = self.norm.forward(x_NC.clone(), extent, false);
@@ -326,6 +330,7 @@ impl Downsample {
         })
     }
 
+    /// `[N, C]` to fewer rows, and their extent: height and width halved, `frames` to `(frames + 1) / 2`, where resampled.
     #[must_use]
     pub fn forward(&self, mut x_NC: Tensor<2>, mut extent: Extent) -> (Tensor<2>, Extent) {
         let channels = x_NC.dims()[1];
@@ -402,6 +407,7 @@ impl Upsample {
         })
     }
 
+    /// `[N, C]` to more rows, and their extent: `frames` to `2 * frames - 1`, height and width doubled, where resampled.
     #[must_use]
     pub fn forward(&self, mut x_NC: Tensor<2>, mut extent: Extent) -> (Tensor<2>, Extent) {
         let channels = x_NC.dims()[1];
