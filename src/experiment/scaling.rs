@@ -12,6 +12,7 @@ const F32: f64 = 4.0;
 /// What links devices.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Interconnect {
+    /// As it is written after `--interconnect`.
     pub name: &'static str,
     /// Bytes per second that a device sends while it receives as many, in a reduction.
     pub bytes_per_second: f64,
@@ -41,7 +42,9 @@ const fn preset(name: &'static str, bytes_per_second: f64, latency: f64) -> Inte
 /// A training, as its plan has it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Training {
+    /// Trainable parameters.
     pub parameters: f64,
+    /// Steps of the whole training.
     pub steps: f64,
     /// Of the whole training.
     pub flop: f64,
@@ -52,9 +55,11 @@ pub struct Training {
 /// What it runs on.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Cluster {
+    /// How many devices train together.
     pub devices: f64,
     /// Floating point operations per second that training comes to on one device.
     pub rate: f64,
+    /// What links them.
     pub interconnect: Interconnect,
     /// Share of computing behind which the reduction can hide.
     pub overlap: f64,
@@ -79,6 +84,7 @@ pub struct Cost {
     pub exposed: f64,
     /// Computing's share of a step.
     pub efficiency: f64,
+    /// Nominal tokens per second of all devices together.
     pub tokens_per_second: f64,
     /// Days to 500 billion tokens, as the paper trains (Supp. B); without checkpoints and failures.
     pub days_to_500_billion: f64,

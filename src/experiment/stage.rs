@@ -232,6 +232,7 @@ pub trait AnyOp: Send + Sync + 'static {
     fn output(&self) -> ArtifactKind;
     /// [`Op::seeded`]: whether what it makes depends on the seed.
     fn seeded(&self) -> bool;
+    /// [`Op::together`]: whether all ranks of a job run it together.
     fn together(&self) -> bool;
     /// The schema of the settings, without `op` and the ports.
     fn schema(&self, generator: &mut SchemaGenerator) -> Schema;

@@ -19,12 +19,21 @@ pub const SIDE: u32 = 512;
 /// Why there is no overlay.
 #[derive(Debug, thiserror::Error)]
 pub enum OverlayError {
+    /// The folder holds no reconstruction that can be drawn.
     #[error("{}: no reconstruction: {reason}", path.display())]
-    Folder { path: PathBuf, reason: String },
+    Folder {
+        /// The folder.
+        path: PathBuf,
+        /// What is lacking or wrong.
+        reason: String,
+    },
+    /// An array of the folder cannot be read.
     #[error(transparent)]
     Arrays(#[from] FormatError),
+    /// The video that was reconstructed cannot be read.
     #[error(transparent)]
     Video(#[from] ReadError),
+    /// The movie cannot be written.
     #[error(transparent)]
     Movie(#[from] MovieError),
 }

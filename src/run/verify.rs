@@ -58,6 +58,7 @@ pub enum Redo {
 /// What to do beside looking.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct How {
+    /// Which stages are done again to compare.
     pub redo: Redo,
     /// Make again what is damaged or gone.
     pub repair: bool,

@@ -368,6 +368,7 @@ pub struct Tokenization<'a> {
 pub struct Tokenized {
     /// Shards of this share, and how many of them were there before.
     pub shards: usize,
+    /// Shards that were there before.
     pub reused: usize,
     /// Clips of this share.
     pub clips: usize,

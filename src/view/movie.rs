@@ -15,21 +15,36 @@ const LARGEST: u64 = 1 << 30;
 /// Why a movie cannot be written.
 #[derive(Debug, thiserror::Error)]
 pub enum MovieError {
+    /// The file cannot be written.
     #[error("{}: {error}", path.display())]
     Io {
+        /// The movie.
         path: PathBuf,
+        /// What the system says.
         error: std::io::Error,
     },
+    /// The name ends in neither.
     #[error("{}: a movie is `.mp4` (by `ffmpeg`) or `.avi`", .0.display())]
     Kind(PathBuf),
+    /// The pictures exceed what the container can hold.
     #[error("{}: more than a gigabyte of pictures does not fit an AVI; name an `.mp4`", .0.display())]
     TooLarge(PathBuf),
+    /// `ffmpeg` refused or was cut off.
     #[error("{}: `ffmpeg` did not write it: {reason}", path.display())]
-    Ffmpeg { path: PathBuf, reason: String },
+    Ffmpeg {
+        /// The movie.
+        path: PathBuf,
+        /// Its last words.
+        reason: String,
+    },
+    /// A picture differs in size from the first.
     #[error("{}: a picture of {found:?} pixels after {expected:?}", path.display())]
     Size {
+        /// The movie.
         path: PathBuf,
+        /// Width and height of the first.
         expected: (usize, usize),
+        /// Width and height of this one.
         found: (usize, usize),
     },
 }

@@ -15,8 +15,11 @@ use std::io::Write;
 /// A skeleton over time, in the world (z up), metres.
 #[derive(Debug)]
 pub struct Wearer<'a> {
+    /// Name of the node: `body`, `left_hand`.
     pub name: &'a str,
+    /// Which joints are linked by bones.
     pub skeleton: &'a Skeleton,
+    /// Joints in the world, metres, z up, one set per sample.
     pub poses: &'a [Joints],
     /// Red, green, blue, `[0, 1]`.
     pub colour: [f32; 3],
@@ -25,7 +28,9 @@ pub struct Wearer<'a> {
 /// The camera over time, `T_world_camera` in the world (z up), and its projection.
 #[derive(Debug)]
 pub struct Camera<'a> {
+    /// `T_world_camera` per sample.
     pub poses: &'a [Rigid],
+    /// Of the square picture.
     pub lens: &'a Intrinsics,
 }
 

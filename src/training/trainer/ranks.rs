@@ -32,17 +32,28 @@ impl Clone for Ranks {
 /// Why a batch cannot be shared between ranks.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum ShareError {
+    /// The batch is not a multiple of the number of ranks.
     #[error(
         "a `batch` of {batch} cannot be shared evenly by {ranks} ranks: take a multiple of {ranks}, or another number of ranks"
     )]
-    Batch { batch: usize, ranks: usize },
+    Batch {
+        /// Samples of a step, over all ranks.
+        batch: usize,
+        /// Processes that train together.
+        ranks: usize,
+    },
+    /// The micro-batches of a step do not divide over the ranks.
     #[error(
         "a `batch` of {batch} in micro-batches of {micro_batch} makes {parts} parts, which {ranks} ranks cannot share evenly: take a smaller `micro_batch`, or another number of ranks"
     )]
     Parts {
+        /// Samples of a step, over all ranks.
         batch: usize,
+        /// Samples of a micro-batch.
         micro_batch: usize,
+        /// Micro-batches of a step.
         parts: usize,
+        /// Processes that train together.
         ranks: usize,
     },
 }

@@ -94,6 +94,7 @@ impl DeviceKind {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub struct DeviceChoice {
+    /// Which kind of device.
     pub kind: DeviceKind,
     /// Counts the devices of the kind from 0; discrete GPUs come first.
     pub index: usize,

@@ -22,16 +22,27 @@ pub struct Launched {
 /// Why processes that were started together cannot work together.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum LaunchError {
+    /// A launcher started several processes of a program that was built without MPI.
     #[error(
         "`{by}` started {size} processes, but this build of `reviv` knows no MPI and would run the experiment {size} times"
     )]
-    NotBuilt { by: &'static str, size: usize },
+    NotBuilt {
+        /// The launcher, by the program's name.
+        by: &'static str,
+        /// How many processes it started.
+        size: usize,
+    },
+    /// The launcher and MPI disagree about the number of processes.
     #[error("`{by}` started {size} processes, but MPI sees {found}")]
     Apart {
+        /// The launcher, by the program's name.
         by: &'static str,
+        /// How many processes it started.
         size: usize,
+        /// How many MPI sees.
         found: usize,
     },
+    /// MPI's own reason.
     #[error("MPI did not start: {0}")]
     Mpi(String),
 }
