@@ -8,6 +8,7 @@ use std::fmt::Write as _;
 
 /// The cluster that trainings are planned for
 #[derive(Debug, clap::Args)]
+#[expect(clippy::struct_field_names, reason = "options as they are typed")]
 pub struct Devices {
     /// Plan the trainings for so many devices
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]

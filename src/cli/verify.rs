@@ -7,6 +7,7 @@ use std::path::PathBuf;
 
 /// Re-hash a run's inputs and artifacts, redo its work from a checkpoint, and demand identical bytes
 #[derive(Debug, clap::Args)]
+#[expect(clippy::struct_excessive_bools, reason = "switches as they are typed")]
 pub struct Verify {
     /// A run: its path, its name, or enough of it
     #[arg(value_name = "RUN")]

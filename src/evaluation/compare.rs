@@ -346,12 +346,12 @@ fn tests(entrants: &[Method], settings: &CompareSettings) -> Option<String> {
     };
     let draws = settings.interval.resamples;
     let least = least_p(draws);
-    let mut text = format!(
+    let text = format!(
         "differences {to}: bootstrap on common clips, p after Holm over the rows of a column; \
          no p is smaller than {least:.2e} before Holm ({draws} draws)"
     );
     let fewest = entrants.iter().map(|e| e.seeds.len()).min().unwrap_or(0);
-    text += &match (fewest, settings.interval.over.contains(&Over::Seeds)) {
+    let seeds = match (fewest, settings.interval.over.contains(&Over::Seeds)) {
         (0 | 1, _) => "; with one seed, training again is in no interval and no p".to_owned(),
         (_, false) => "; seeds are averaged: training again is in no interval and no p".to_owned(),
         (n, true) => format!(
@@ -359,7 +359,7 @@ fn tests(entrants: &[Method], settings: &CompareSettings) -> Option<String> {
             least_p_of_trainings(n, n)
         ),
     };
-    Some(text)
+    Some(text + &seeds)
 }
 
 fn notes(

@@ -47,7 +47,7 @@ impl std::fmt::Debug for Model {
         f.debug_struct("Model")
             .field("spec", self.mget.spec())
             .field("tokenizers", &self.tokenizers)
-            .finish()
+            .finish_non_exhaustive()
     }
 }
 

@@ -32,7 +32,7 @@ impl Pathway {
     }
 
     /// What the model calls a modality of the clips.
-    pub fn slot<'a>(self, modality: &'a str) -> Cow<'a, str> {
+    pub fn slot(self, modality: &str) -> Cow<'_, str> {
         if self == Self::Wide && PICTURES.contains(&modality) {
             Cow::Owned(format!("{modality}{WIDE}"))
         } else {

@@ -63,9 +63,12 @@ impl Overlay {
         let manifest: Manifest =
             serde_json::from_slice(&text).map_err(|e| refuse(e.to_string()))?;
         let has = |file: &str| manifest.files.iter().any(|name| name == file);
-        let arrays = |file: &str| match has(file) {
-            true => Npz::read(&folder.join(file)),
-            false => Ok(Npz::default()),
+        let arrays = |file: &str| {
+            if has(file) {
+                Npz::read(&folder.join(file))
+            } else {
+                Ok(Npz::default())
+            }
         };
         let joints = |npz: &Npz, name: &str| -> Result<Vec<Joints>, OverlayError> {
             let Ok(array) = npz.get(name) else {

@@ -33,7 +33,13 @@ pub fn spread(samples: &[Tracks]) -> BTreeMap<&'static str, Array2<f32>> {
     found
 }
 
-const SIGNALS: [(&str, fn(&Tracks) -> Points); 5] = [
+/// A name, the frame it is in, and where tracks have it.
+type Motion = (&'static str, &'static str, fn(&Tracks) -> &[Joints]);
+
+/// A name and how its points come out of tracks.
+type Signal = (&'static str, fn(&Tracks) -> Points);
+
+const SIGNALS: [Signal; 5] = [
     ("camera", |tracks| {
         let at = |pose: &crate::geometry::rigid::Rigid| {
             vec![pose.translation.vector.iter().copied().collect()]
@@ -123,7 +129,7 @@ pub(super) fn arrays(samples: &[Tracks]) -> (Npz, Vec<ArrayFacts>) {
         );
         npz = npz.with("gaze", array);
     }
-    let motions: [(&str, &str, fn(&Tracks) -> &[Joints]); 3] = [
+    let motions: [Motion; 3] = [
         ("body", "world, z up", Tracks::body),
         ("left_hand", "camera of the same sample", Tracks::left_hand),
         (

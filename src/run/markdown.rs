@@ -56,8 +56,9 @@ fn folded<'a>(events: impl Iterator<Item = Event<'a>>) -> Vec<Event<'a>> {
                 }
             }
             event => {
-                let cell = rows.last_mut().and_then(|row| row.last_mut());
-                cell.into_iter().for_each(|cell| cell.push(event.clone()));
+                if let Some(cell) = rows.last_mut().and_then(|row| row.last_mut()) {
+                    cell.push(event);
+                }
             }
         }
     }

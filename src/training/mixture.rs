@@ -17,7 +17,7 @@ impl Mixture<'_> {
     /// The clips that are read of each data set, of `clips` in all.
     pub(super) fn ranges(&self, clips: usize) -> Vec<Range<usize>> {
         if self.sets.is_empty() {
-            return vec![0..clips];
+            return std::iter::once(0..clips).collect();
         }
         let mut start = 0;
         let range = |(set, (_, clips)): (usize, &(&str, usize))| {
@@ -56,7 +56,10 @@ mod tests {
 
     #[test]
     fn what_is_never_drawn_is_not_read() {
-        assert_eq!(Mixture::default().ranges(7), [0..7]);
+        assert_eq!(
+            Mixture::default().ranges(7),
+            std::iter::once(0..7).collect::<Vec<_>>()
+        );
         let sets = [("a", 3), ("b", 2), ("c", 2)];
         let weighted = |weights| Mixture {
             sets: &sets,

@@ -2,6 +2,7 @@
 
 use crate::layouts_bad::copy;
 use serde_json::{Map, Value, json};
+use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
@@ -153,10 +154,10 @@ fn tiny_paper(layouts: &Path, adt: Option<&Path>, folder: &Path) -> Vec<String> 
         ("h2o", "h2o"),
         ("mano", "fake_mano"),
     ] {
-        data.push_str(&format!("{name}: {}\n", layouts.join(set).display()));
+        writeln!(data, "{name}: {}", layouts.join(set).display()).unwrap();
     }
     if let Some(adt) = adt {
-        data.push_str(&format!("adt: {}\n", adt.display()));
+        writeln!(data, "adt: {}", adt.display()).unwrap();
     }
     std::fs::write(folder.join("data.yaml"), data).unwrap();
     names

@@ -95,7 +95,7 @@ impl Tokenize {
             &names.collect(),
             per_shard,
         )
-        .map_err(|error| Failure::machine(error))?;
+        .map_err(Failure::machine)?;
         let work = Tokenization {
             header: &header,
             splits: &sets

@@ -102,9 +102,12 @@ pub(super) fn run(
         clock: &|| watch.seconds(),
     };
     let fitted = fit
-        .run(&mut |event| match root {
-            true => record.heard(event, context),
-            false => Ok(Flow::Continue),
+        .run(&mut |event| {
+            if root {
+                record.heard(event, context)
+            } else {
+                Ok(Flow::Continue)
+            }
         })
         .map_err(|failure| match failure {
             Failure::Training(error) => input_error(error),

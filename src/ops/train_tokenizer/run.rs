@@ -80,9 +80,12 @@ pub(super) fn run(
         resume: resume.map(|(_, path)| path),
     };
     let fitted = fit
-        .run(&mut |event| match root {
-            true => heard(event, having, settings, context),
-            false => Ok(Flow::Continue),
+        .run(&mut |event| {
+            if root {
+                heard(event, having, settings, context)
+            } else {
+                Ok(Flow::Continue)
+            }
         })
         .map_err(|failure: Failure| match failure {
             Failure::Training(error) => failed(error, settings),

@@ -171,8 +171,8 @@ impl Glb {
         start: usize,
     ) {
         let times = self.times(poses.len());
-        let mut turns = vec![Vec::with_capacity(4 * poses.len()); JOINTS];
-        let mut moves = vec![Vec::with_capacity(3 * poses.len()); JOINTS];
+        let mut turns = vec![Vec::new(); JOINTS];
+        let mut moves = vec![Vec::new(); JOINTS];
         let mut before = [UnitQuaternion::identity(); JOINTS];
         for pose in poses {
             let world = rotations(skeleton, offsets, pose);

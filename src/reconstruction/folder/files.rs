@@ -36,7 +36,7 @@ impl Reconstruction {
                 ScaleStatus::None,
                 None,
             );
-            files.array("confidence.npz", &Array1::from(values.clone()), facts);
+            files.array("confidence.npz", Array1::from(values.clone()), facts);
         }
         let (arrays, names) = files.finish()?;
         manifest.arrays.extend(arrays);

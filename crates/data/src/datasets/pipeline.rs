@@ -97,7 +97,7 @@ pub(super) fn in_order<T: Send, R>(
         loop {
             let positions = {
                 let mut state = shared.state();
-                let full = |state: &State<T>| state.begun >= state.taken + run * threads + 1;
+                let full = |state: &State<T>| state.begun > state.taken + run * threads;
                 while !state.over && state.begun < count && full(&state) {
                     state = shared.wait(state);
                 }

@@ -81,6 +81,7 @@ impl FormatError {
     }
 
     /// The same error with its file; an error that has one keeps it.
+    #[must_use]
     pub fn in_file(self, path: &Path) -> Self {
         match self {
             Self::File { .. } => self,

@@ -359,22 +359,19 @@ impl Wanted {
         };
         let shown = &self.index.shown;
         self.ranks = part.frames.iter().map(|&k| (shown[k], k)).collect();
-        match self.standing(part.start) {
-            Some(standing) => {
-                self.pictures = standing.pictures;
-                self.next = standing.next;
-                self.first_rank = standing.first_rank;
+        if let Some(standing) = self.standing(part.start) {
+            self.pictures = standing.pictures;
+            self.next = standing.next;
+            self.first_rank = standing.first_rank;
+        } else {
+            if part.start != self.next {
+                self.pictures.restart();
             }
-            None => {
-                if part.start != self.next {
-                    self.pictures.restart();
-                }
-                self.next = part.start;
-                self.first_rank = match part.start {
-                    0 => 0,
-                    start => self.index.rank[start],
-                };
-            }
+            self.next = part.start;
+            self.first_rank = match part.start {
+                0 => 0,
+                start => self.index.rank[start],
+            };
         }
         self.pending.clear();
         self.delivered = 0;

@@ -299,6 +299,10 @@ pub fn indices(ids: &[u32], like: &Tensor<2>) -> Tensor<1, Int> {
 
 /// The Euclidean norm of several arrays together, where they are.
 #[derive(Debug, Clone)]
+#[expect(
+    clippy::large_enum_variant,
+    reason = "one a step; a box would only be another place to look"
+)]
 pub enum Norm {
     /// On the processor: known.
     Host(f64),
