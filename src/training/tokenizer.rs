@@ -638,9 +638,10 @@ mod tests {
             .collect();
         let small = seen.iter().filter(|index| **index < 10).count();
         assert!(small.abs_diff(3000) < 150, "{small} of {}", seen.len());
-        // Each signal of a data set as often as the others of it.
+        // Each signal of a data set as often as the others of it: once an epoch of 10, where its set is drawn, so 400 times in 3 of 4,
+        // with a standard deviation of 8.7.
         let of = |signal: usize| seen.iter().filter(|index| **index == signal).count();
-        assert!((0..10).all(|signal| of(signal).abs_diff(small / 10) <= 1));
+        assert!((0..10).all(|signal| of(signal).abs_diff(small / 10) < 45));
         assert!((10..100).all(|signal| of(signal) > 0));
         for (lengths, weights) in [
             ([10, 0, 90], vec![1.0, 1.0, 1.0]),

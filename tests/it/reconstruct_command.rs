@@ -378,7 +378,8 @@ fn a_depth_network_gives_the_metric_scale_of_a_whole_video() {
     pictures(&place.path("walk"), 70, [48, 40], false);
     let with = |output: &str| {
         let mut command = place.command("walk", output);
-        command.args(["--anchor-model", "network", "--runs", output]);
+        let runs = format!("runs_{output}");
+        command.args(["--anchor-model", "network", "--runs", runs.as_str()]);
         command.assert().success();
         std::fs::read_to_string(place.path(output).join("manifest.json")).unwrap()
     };
