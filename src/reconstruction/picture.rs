@@ -19,13 +19,13 @@ pub(super) fn shows_something(views: &[View<'_>]) -> Result<(), ScaleRefusal> {
         values.sort_by(f64::total_cmp);
         values.get(values.len() / 2).copied()
     };
-    let contrast = median(pictures.iter().map(|p| moments(p, p).1.sqrt()).collect());
+    let contrast = median(pictures.iter().map(|p| covariance(p, p).sqrt()).collect());
     if contrast.is_some_and(|contrast| contrast < LEAST_CONTRAST) {
         return Err(ScaleRefusal::Blank);
     }
     let alike = pictures.windows(2).map(|pair| {
-        let both = moments(&pair[0], &pair[1]).1;
-        let own = moments(&pair[0], &pair[0]).1 * moments(&pair[1], &pair[1]).1;
+        let both = covariance(&pair[0], &pair[1]);
+        let own = covariance(&pair[0], &pair[0]) * covariance(&pair[1], &pair[1]);
         both / own.sqrt().max(1e-9)
     });
     if median(alike.collect()).is_some_and(|alike| alike < LEAST_CORRELATION) {
@@ -46,11 +46,10 @@ fn blocks(picture: ArrayView3<'_, u8>) -> Vec<f64> {
     sums.into_iter().map(|(sum, n)| sum / n).collect()
 }
 
-/// Mean of the first, and covariance.
-fn moments(a: &[f64], b: &[f64]) -> (f64, f64) {
+fn covariance(a: &[f64], b: &[f64]) -> f64 {
     let n = a.len().max(1) as f64;
     let mean = |v: &[f64]| v.iter().sum::<f64>() / n;
     let (ma, mb) = (mean(a), mean(b));
     let sum: f64 = a.iter().zip(b).map(|(x, y)| (x - ma) * (y - mb)).sum();
-    (ma, sum / n)
+    sum / n
 }

@@ -128,8 +128,8 @@ impl ClipsSettings {
         (format.size * format.size * format.frames * 7) as u64 + 80_000
     }
 
-    /// Seconds of one core that a clip of recordings takes, nearly all of it decoding: two seconds of 1080p H.264 at 30 frames per
-    /// second or of 16 jpegs of 1408 x 1408 were measured (`cargo bench --bench recordings`).
+    /// Seconds of one core that a clip of recordings takes, nearly all of it decoding. An assumption: `cargo bench -p reviv-data --bench
+    /// sets` measures what a data set takes.
     pub(super) fn core_seconds(&self) -> Option<f64> {
         self.source.settings.data.as_ref().map(|_| 1.0)
     }
