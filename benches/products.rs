@@ -11,7 +11,10 @@ use reviv::engine::ops::gemm::{Matrix, Threads, gemm_into};
 use std::hint::black_box;
 use std::path::PathBuf;
 use std::process::ExitCode;
-use std::time::Instant;
+use std::time::{Duration, Instant};
+
+/// How long to wait before a turn of ours: threads of OpenMP go on spinning for 200 ms after a product, on the cores that are measured.
+const SPIN: Duration = Duration::from_millis(300);
 
 /// Measures products.
 #[derive(Debug, Parser)]
@@ -198,6 +201,9 @@ fn measure(row: &Row, blas: Option<&blas::Blas>, rounds: usize) -> (f64, Option<
     };
     let (mut ours, mut theirs) = (Vec::new(), Vec::new());
     for round in 0..=rounds {
+        if blas.is_some() {
+            std::thread::sleep(SPIN);
+        }
         let own = timed(&mut || {
             gemm_into(&mut c, n, left, right, 1.0, false, Threads::All);
             black_box(&c);
