@@ -65,6 +65,11 @@ impl VqTokenizer {
                 normaliser.width()
             )));
         }
+        if normaliser.is_root_relative() != model.settings().root_relative {
+            return Err(TokenizerError::Other(format!(
+                "{modality}: the normalisation and the model do not agree on `root_relative`"
+            )));
+        }
         Ok(Self {
             modality: modality.to_owned(),
             shape,
@@ -176,7 +181,8 @@ impl VqTokenizer {
                 ))),
             }
         };
-        let normaliser = Normaliser::new(statistics(MEAN)?, statistics(DEVIATION)?)?;
+        let normaliser = Normaliser::new(statistics(MEAN)?, statistics(DEVIATION)?)?
+            .of_joints(settings.root_relative)?;
         let unfit = |error: EngineError| wrong("weights", error.to_string());
         VqVae::new(&Initialise::meta(compute), &settings, &shape)?
             .check_shapes(&weights)
@@ -265,7 +271,7 @@ pub fn prepare(
         if signal.values.shape() != expected {
             return Err(shape_error(index, signal.values.shape(), expected));
         }
-        let valid = match &signal.valid {
+        let mut valid = match &signal.valid {
             None => None,
             Some(valid) if valid.shape() == model.patches().valid_shape() => {
                 Some(valid.iter().copied().collect::<Vec<bool>>())
@@ -294,6 +300,12 @@ pub fn prepare(
                     index,
                     position,
                 });
+            }
+        }
+        if let Some(valid) = valid.as_mut().filter(|_| normaliser.is_root_relative()) {
+            for sample in valid.chunks_mut(normaliser.width() / channels) {
+                let root = sample.first().is_some_and(|valid| *valid);
+                sample.iter_mut().for_each(|valid| *valid &= root);
             }
         }
         normaliser.apply(&mut values);

@@ -16,6 +16,7 @@ pub mod memory;
 pub mod mget;
 pub mod mget_fit;
 pub mod mixture;
+pub mod muon;
 pub mod optimizer;
 pub mod sampler;
 pub mod schedule;

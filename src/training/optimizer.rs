@@ -9,7 +9,8 @@ use burn::tensor::{Tensor, TensorData};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::engine::ops::{self, AdamWStep};
+use super::muon;
+use crate::engine::ops::{self, AdamWStep, Norm};
 use crate::engine::parameters::{Kind, to_host};
 use crate::engine::{EngineError, Gradients, HostTensor, Parameters, Values, Weights};
 
@@ -25,6 +26,8 @@ pub struct AdamWSettings {
     pub weight_decay: f64,
     /// Largest norm of all gradients together, above 0; larger ones are scaled down. `null`: no limit.
     pub clip_norm: Option<f64>,
+    /// Muon for the matrices inside blocks: their momentum is made orthogonal first. Everything else steps as before.
+    pub muon: bool,
 }
 
 impl Default for AdamWSettings {
@@ -34,6 +37,7 @@ impl Default for AdamWSettings {
             epsilon: 1e-8,
             weight_decay: 0.05,
             clip_norm: Some(1.0),
+            muon: false,
         }
     }
 }
@@ -70,7 +74,8 @@ pub fn decays(name: &str) -> bool {
 #[derive(Debug, Clone)]
 struct Moments {
     mean: Tensor<1>,
-    square: Tensor<1>,
+    /// Nothing where Muon steps, which has no use for it.
+    square: Option<Tensor<1>>,
 }
 
 /// The optimizer and its state.
@@ -99,9 +104,11 @@ impl AdamW {
         model.visit("", &mut |name, parameter| {
             if parameter.kind() == Kind::Trainable {
                 let zeros = parameter.untracked().zeros_like();
+                let with_muon =
+                    settings.muon && muon::matrices(name, parameter.shape()).is_some();
                 let pair = Moments {
                     mean: zeros.clone(),
-                    square: zeros,
+                    square: (!with_muon).then_some(zeros),
                 };
                 moments.insert(name.to_owned(), pair);
             }
@@ -132,7 +139,11 @@ impl AdamW {
         mut gradients: Gradients,
         rate: f64,
     ) -> Result<f64, NotFinite> {
-        let norm = gradients.norm();
+        let mut norm = gradients.norm();
+        if self.settings.muon {
+            // Its step on a device does not refuse itself.
+            norm = Norm::Host(norm.read());
+        }
         if let Some(norm) = norm.known().filter(|norm| !norm.is_finite()) {
             return Err(NotFinite {
                 step: self.step + 1,
@@ -164,16 +175,32 @@ impl AdamW {
                 0.0
             };
             let tracked = parameter.is_tracked();
-            let (values, mean, square) = ops::adamw(
-                parameter.take(),
-                gradient,
-                state.mean,
-                state.square,
-                &norm,
-                step,
-            );
-            parameter.put(values, tracked);
-            moments.insert(name.to_owned(), Moments { mean, square });
+            let moved = if let Some(square) = state.square {
+                let (values, mean, square) =
+                    ops::adamw(parameter.take(), gradient, state.mean, square, &norm, step);
+                parameter.put(values, tracked);
+                Moments {
+                    mean,
+                    square: Some(square),
+                }
+            } else {
+                let &[rows, columns] = parameter.shape() else {
+                    unreachable!("Muon is for matrices");
+                };
+                let stacked = muon::matrices(name, &[rows, columns]).unwrap_or(1);
+                let (values, mean) = muon::step(
+                    parameter.take(),
+                    gradient,
+                    state.mean,
+                    [rows, columns],
+                    stacked,
+                    rate,
+                    step.decay,
+                );
+                parameter.put(values, tracked);
+                Moments { mean, square: None }
+            };
+            moments.insert(name.to_owned(), moved);
         });
         // On a device the step has refused itself; nobody has waited for it so far.
         let norm = norm.read();
@@ -187,7 +214,7 @@ impl AdamW {
         Ok(norm)
     }
 
-    /// The state as arrays: `step`, `exp_avg.<name>`, `exp_avg_sq.<name>`.
+    /// The state as arrays: `step`, `exp_avg.<name>` and, where Muon does not step, `exp_avg_sq.<name>`.
     #[must_use]
     pub fn state(&self) -> Weights {
         let mut weights = Weights::default();
@@ -197,7 +224,8 @@ impl AdamW {
         };
         weights.tensors.insert("step".to_owned(), step);
         for (name, moments) in &self.moments {
-            for (kind, tensor) in [("exp_avg", &moments.mean), ("exp_avg_sq", &moments.square)] {
+            let square = moments.square.as_ref().map(|s| ("exp_avg_sq", s));
+            for (kind, tensor) in [("exp_avg", &moments.mean)].into_iter().chain(square) {
                 let values = to_host(tensor.clone());
                 let length = values.len();
                 weights.insert_f32(&format!("{kind}.{name}"), values, &[length]);
@@ -213,6 +241,7 @@ impl AdamW {
     pub fn restore(&mut self, state: &Weights) -> Result<(), EngineError> {
         let step = state.get("step", &[1])?.i64("step")?[0];
         let mut restored = BTreeMap::new();
+        let mut arrays = 1;
         for (name, moments) in &self.moments {
             let read = |kind: &str, like: &Tensor<1>| -> Result<Tensor<1>, EngineError> {
                 let name = format!("{kind}.{name}");
@@ -225,11 +254,15 @@ impl AdamW {
             };
             let pair = Moments {
                 mean: read("exp_avg", &moments.mean)?,
-                square: read("exp_avg_sq", &moments.square)?,
+                square: match &moments.square {
+                    Some(square) => Some(read("exp_avg_sq", square)?),
+                    None => None,
+                },
             };
+            arrays += 1 + usize::from(pair.square.is_some());
             restored.insert(name.clone(), pair);
         }
-        let unknown = state.tensors.len().saturating_sub(1 + 2 * restored.len());
+        let unknown = state.tensors.len().saturating_sub(arrays);
         if unknown > 0 {
             return Err(EngineError::Unknown {
                 count: unknown,

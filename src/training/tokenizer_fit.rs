@@ -131,7 +131,7 @@ impl TokenizerFit<'_> {
         let (signals, sets) = self.signals(modality, callback)?;
         let width = model.patches().values_per_sample();
         let normaliser = self
-            .normaliser(&signals, width)
+            .normaliser(&signals, width, sizes.root_relative)
             .map_err(TrainingError::from)?;
         let prepared =
             prepare(self.modality, &model, &normaliser, &signals).map_err(TrainingError::from)?;
@@ -178,8 +178,10 @@ impl TokenizerFit<'_> {
             normaliser.undo(&mut values);
             Some(values)
         };
+        let mut mean = vec![0.0; width];
+        normaliser.undo(&mut mean);
         let baselines = Baselines {
-            mean: normaliser.mean().repeat(patches.valid_shape()[0]),
+            mean: mean.repeat(patches.valid_shape()[0]),
             codebook: &project,
         };
         let (scores, examples) = self.score(modality, &tokenizer, &baselines, callback)?;
@@ -345,16 +347,21 @@ impl TokenizerFit<'_> {
 
     /// Statistics of the training signals, or the fixed ones where the reference has them: gaze becomes [-1, 1], and
     /// what is declared `normalize: none` stays.
-    fn normaliser(&self, signals: &[Signal], width: usize) -> Result<Normaliser, TokenizerError> {
+    fn normaliser(
+        &self,
+        signals: &[Signal],
+        width: usize,
+        root_relative: bool,
+    ) -> Result<Normaliser, TokenizerError> {
         if self.modality == "gaze" {
             return Normaliser::constant(width, 0.5, 0.5);
         }
         let mut declared = self.format.declared.iter();
         let declared = declared.find(|declared| declared.name == self.modality);
         if declared.is_some_and(|declared| declared.normalize == Normalize::None) {
-            return Normaliser::constant(width, 0.0, 1.0);
+            return Normaliser::constant(width, 0.0, 1.0)?.of_joints(root_relative);
         }
-        Normaliser::fit(signals.iter(), width)
+        Normaliser::fit(signals.iter(), width, root_relative)
     }
 
     fn score<E: From<TrainingError> + std::fmt::Display>(

@@ -109,7 +109,7 @@ fn errors(modality: &str, clip: &Signal, normaliser: Option<Normaliser>) -> (f64
     let model = VqVae::new(&Initialise::new(&compute, 0), &sizes, &shape).unwrap();
     let training = variations(clip);
     let normaliser =
-        normaliser.unwrap_or_else(|| Normaliser::fit(training.iter(), channels).unwrap());
+        normaliser.unwrap_or_else(|| Normaliser::fit(training.iter(), channels, false).unwrap());
     let data = prepare(modality, &model, &normaliser, &training).unwrap();
     let settings = TokenizerTraining {
         steps: 150,

@@ -149,26 +149,31 @@ fn bytes(trainer: &Trainer<MaskedPrediction>) -> Vec<u8> {
 
 #[test]
 fn resuming_at_any_step_with_any_number_of_threads_gives_the_same_bytes() {
-    for micro_batch in [0, 4] {
-        let whole = Setup::new(12, micro_batch, 1);
+    for (micro_batch, muon) in [(0, false), (4, false), (4, true)] {
+        let setup = |threads| {
+            let mut setup = Setup::new(12, micro_batch, threads);
+            setup.settings.optimizer.muon = muon;
+            setup
+        };
+        let whole = setup(1);
         let mut trainer = whole.trainer();
         whole.run(&mut trainer, 0..12).unwrap();
         let expected = bytes(&trainer);
         for (cut, threads) in [(1, 2), (5, 3), (11, 1)] {
             let checkpoint = tempfile::tempdir().unwrap();
-            let first = Setup::new(12, micro_batch, threads);
+            let first = setup(threads);
             let mut trainer = first.trainer();
             first.run(&mut trainer, 0..cut).unwrap();
             trainer.save(checkpoint.path()).unwrap();
             drop(trainer);
 
-            let second = Setup::new(12, micro_batch, threads + 1);
+            let second = setup(threads + 1);
             let mut trainer = second.trainer();
             trainer.resume(checkpoint.path()).unwrap();
             second.run(&mut trainer, cut..12).unwrap();
             assert!(
                 bytes(&trainer) == expected,
-                "cut at {cut}, micro-batch {micro_batch}"
+                "cut at {cut}, micro-batch {micro_batch}, muon {muon}"
             );
         }
     }

@@ -48,6 +48,11 @@ pub struct VqSettings {
     /// a small codebook spends itself on them; this makes it keep the pose. 0: none, as in the paper.
     #[serde(skip_serializing_if = "is_zero")]
     pub pose_weight: f64,
+    /// For joints: all but the first (pelvis, wrist) are seen from it before they are scaled. Where a whole body is varies by metres
+    /// and its pose by centimetres; this gives each the same weight. Not in the paper. A sample without its first joint counts as
+    /// not valid.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    pub root_relative: bool,
     /// Decay of the running means of codes and counts.
     pub ema_decay: f64,
     /// Codes with a smaller running count are replaced by latents of the batch.
@@ -79,6 +84,7 @@ impl Default for VqSettings {
             loss: Loss::MaskedMse,
             velocity_weight: 0.0,
             pose_weight: 0.0,
+            root_relative: false,
             ema_decay: 0.99,
             dead_below: 2.0,
             commitment_weight: 1.0,
@@ -167,8 +173,13 @@ impl VqSettings {
                     .to_owned(),
             );
         }
-        if self.pose_weight > 0.0 && !matches!(shape, Shape::Kinematic { .. }) {
-            return wrong("pose_weight is for joints; a signal over time has no pose".to_owned());
+        if !matches!(shape, Shape::Kinematic { .. }) {
+            if self.pose_weight > 0.0 {
+                return wrong("pose_weight is for joints; a signal over time has no pose".to_owned());
+            }
+            if self.root_relative {
+                return wrong("root_relative is for joints; a signal over time has no root".to_owned());
+            }
         }
         Patches::new(shape, &self.compression)
     }
