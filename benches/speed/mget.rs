@@ -127,7 +127,7 @@ pub fn activation_checkpointing(meter: &Meter) {
     model.start_training();
     let mut optimizer = AdamW::new(AdamWSettings::default(), &model);
     meter.measure("train step, recomputed", || {
-        let (_, gradients) = model.recomputed(&batch, Loss::Mod, 1.0);
+        let (_, gradients) = model.recomputed(&batch, Loss::Mod, 1.0, &mut |_, _| ());
         optimizer
             .step(&mut model, gradients.expect("something is asked for"), 1e-4)
             .expect("the gradients are finite");

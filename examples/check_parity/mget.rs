@@ -418,6 +418,7 @@ fn training(mut file: Vectors, report: &mut Report) -> Outcome {
         epsilon: number(&settings["eps"])?,
         weight_decay: number(&settings["weight_decay"])?,
         clip_norm: Some(number(&settings["clip"])?),
+        shard: false,
     };
     model.start_training();
     let mut optimizer = AdamW::new(settings, &model);

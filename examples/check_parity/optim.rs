@@ -61,6 +61,7 @@ fn adamw(mut file: Vectors, report: &mut Report) -> Outcome {
             epsilon: number(&settings["eps"])?,
             weight_decay: number(&settings["weight_decay"])?,
             clip_norm: Some(number(&settings["clip"])?),
+            shard: false,
         },
         &model,
     );
@@ -83,7 +84,7 @@ fn adamw(mut file: Vectors, report: &mut Report) -> Outcome {
             file.compare(report, &output, parameter.shape(), &parameter.to_vec())?;
         }
     }
-    let state = optimizer.state();
+    let state = optimizer.state()?.ok_or("the state of one rank")?;
     for (name, parameter) in &model {
         for kind in ["exp_avg", "exp_avg_sq"] {
             let values = state.get(&format!("{kind}.{name}"), &[parameter.len()])?;

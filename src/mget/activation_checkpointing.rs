@@ -1,20 +1,24 @@
 //! Gradients with the activations of one block at a time: of every block its input is kept, and backward computes the block
-//! once more. More arithmetic, and memory that hardly grows with depth.
+//! once more. More arithmetic, and memory that hardly grows with depth. Parts of the model are complete one after the other, as in
+//! `backward_in_parts`.
 
 use super::batch::{Batch, EncoderInput};
 use super::loss::{Loss, LossValues};
 use super::model::{Mget, decoder_segments};
+use crate::engine::gradients::Complete;
 use crate::engine::{Gradients, Parameters, Segments, Tensor};
 
 impl Mget {
     /// The losses of a batch, and the gradients of `share` times their total; `None` when there is no target or the total is not
-    /// finite. Equal to [`Mget::losses`] and [`Gradients::of`] up to rounding.
+    /// finite. Equal to [`Mget::losses`] and [`Gradients::of`] up to rounding. `complete` hears of the gradients of every part when
+    /// backward is done with it, in the order of [`Mget::backward_order`].
     #[must_use]
     pub fn recomputed(
         &self,
         batch: &Batch,
         kind: Loss,
         share: f64,
+        complete: &mut Complete<'_>,
     ) -> (LossValues, Option<Gradients>) {
         let frozen = self.frozen();
         let encoder = frozen.encoder_inputs(&batch.visible);
@@ -45,11 +49,13 @@ impl Mget {
         }
         let [mut dy_MD] = gradients.add(&(total * share), self, [&y_MD]);
         drop(y_MD);
+        gradients.close("decoder_norm", &self.decoder_norm, complete);
+        gradients.close("decoder_embeddings", &self.decoder_embeddings, complete);
 
         let targets = &batch.targets.sequence;
         let (own_modality, visible) = decoder_segments(&batch.visible.sequence.lengths, targets);
         let mut dcontext_ND: Option<Tensor<2>> = None;
-        for (block, input_MD) in self.decoder.iter().zip(&decoder).rev() {
+        for (index, (block, input_MD)) in self.decoder.iter().zip(&decoder).enumerate().rev() {
             let y_MD = leaf(input_MD);
             let context_ND = context_ND.as_ref().map(leaf);
             let out_MD = block.forward(y_MD.clone(), context_ND.as_ref(), &own_modality, &visible);
@@ -64,6 +70,7 @@ impl Mget {
             } else {
                 [dy_MD] = gradients.add(&slope, self, [&y_MD]);
             }
+            gradients.close_item("decoder", index, block, complete);
         }
         let [] = gradients.add(&(self.decoder_queries(targets) * dy_MD).sum(), self, []);
 
@@ -73,11 +80,14 @@ impl Mget {
                 .positional_embedding(&batch.visible.sequence);
             let context_ND = self.context(self.encoder_norm.forward(h_ND.clone()), positional_ND);
             let [mut dh_ND] = gradients.add(&(context_ND * dcontext_ND).sum(), self, [&h_ND]);
+            gradients.close("encoder_norm", &self.encoder_norm, complete);
+            gradients.close("decoder_proj_context", &self.decoder_proj_context, complete);
             let samples = Segments::within(&batch.visible.sequence.lengths);
-            for (block, input_ND) in self.encoder.iter().zip(&encoder).rev() {
+            for (index, (block, input_ND)) in self.encoder.iter().zip(&encoder).enumerate().rev() {
                 let h_ND = leaf(input_ND);
                 let out_ND = block.forward(h_ND.clone(), &samples);
                 [dh_ND] = gradients.add(&(out_ND * dh_ND).sum(), self, [&h_ND]);
+                gradients.close_item("encoder", index, block, complete);
             }
             // Anew: backward has consumed the graph of the first.
             let positional_ND = self
@@ -86,7 +96,7 @@ impl Mget {
             let input_ND = self.input_embedding(&batch.visible, positional_ND);
             let [] = gradients.add(&(input_ND * dh_ND).sum(), self, []);
         }
-        gradients.complete(self);
+        gradients.close("", self, complete);
         (values, Some(gradients))
     }
 
@@ -198,7 +208,7 @@ mod tests {
         for batch in cases {
             let whole = model.losses(&batch, Loss::Mod);
             let expected = Gradients::of(&(whole.total.clone().unwrap() * 0.5), &model);
-            let (values, found) = model.recomputed(&batch, Loss::Mod, 0.5);
+            let (values, found) = model.recomputed(&batch, Loss::Mod, 0.5, &mut |_, _| ());
             let found = found.unwrap();
             assert_eq!(values, whole.values());
             assert_eq!(found.iter().count(), expected.iter().count());
@@ -209,6 +219,72 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn gradients_in_parts_are_those_of_the_whole_graph_to_the_bit_and_complete_when_they_are_said_to_be()
+     {
+        let nothing: [&[u32]; 3] = [&[], &[], &[]];
+        let cases = [
+            batch(
+                [[&[0, 2], &[1], &[0, 5]], [&[], &[3], &[]]],
+                [[&[1], &[0, 2], &[]], [&[0, 1, 2], &[], &[]]],
+            ),
+            batch([nothing, nothing], [[&[1], &[0], &[]], nothing]),
+        ];
+        let bits = |gradient: &Tensor<1>| -> Vec<u32> {
+            to_host(gradient.clone())
+                .into_iter()
+                .map(f32::to_bits)
+                .collect()
+        };
+        for model in [Precision::F32, Precision::Bf16].map(model_in) {
+            for batch in &cases {
+                let whole = model.losses(batch, Loss::Mod);
+                let expected = Gradients::of(&(whole.total.clone().unwrap() * 0.5), &model);
+                let mut told: Vec<(String, Vec<u32>)> = Vec::new();
+                let mut hear = |name: &str, gradient: &Tensor<1>| {
+                    if told.iter().all(|(other, _)| other != name) {
+                        told.push((name.to_owned(), bits(gradient)));
+                    }
+                };
+                let (values, found) = model.gradients_in_parts(batch, Loss::Mod, 0.5, &mut hear);
+                let found = found.unwrap();
+                assert_eq!(values, whole.values());
+                assert_eq!(found.iter().count(), expected.iter().count());
+                assert_eq!(told.len(), expected.iter().count());
+                for (name, early) in &told {
+                    let gradient = expected.get(name).unwrap();
+                    assert_eq!(bits(found.get(name).unwrap()), bits(gradient), "{name}");
+                    assert_eq!(*early, bits(gradient), "{name} when it was told");
+                }
+                let (_, recomputed) = model.recomputed(batch, Loss::Mod, 0.5, &mut |_, _| ());
+                assert_eq!(recomputed.unwrap().iter().count(), told.len());
+            }
+        }
+    }
+
+    #[test]
+    fn the_order_of_backward_names_every_parameter_once_and_blocks_from_the_last_to_the_first() {
+        let model = model();
+        let order = model.backward_order();
+        let mut names: Vec<String> = model.inventory().into_iter().map(|entry| entry.0).collect();
+        let at = |part: &str| {
+            order
+                .iter()
+                .position(|name| name.starts_with(part))
+                .unwrap()
+        };
+        assert!(
+            at("decoder_embeddings.") < at("decoder.2.") && at("decoder.2.") < at("decoder.0.")
+        );
+        assert!(
+            at("decoder.0.") < at("encoder.1.") && at("encoder.0.") < at("encoder_embeddings.")
+        );
+        let mut sorted = order.clone();
+        sorted.sort();
+        names.sort();
+        assert_eq!(sorted, names);
     }
 
     #[test]
@@ -246,7 +322,7 @@ mod tests {
     fn a_batch_that_asks_for_nothing_has_no_gradient() {
         let nothing: [&[u32]; 3] = [&[], &[], &[]];
         let batch = batch([[&[0], &[], &[]], nothing], [nothing, nothing]);
-        let (values, gradients) = model().recomputed(&batch, Loss::Mod, 1.0);
+        let (values, gradients) = model().recomputed(&batch, Loss::Mod, 1.0, &mut |_, _| ());
         assert_eq!(values.total, 0.0);
         assert!(gradients.is_none());
     }

@@ -2,9 +2,11 @@
 //!
 //! Read in this order: [`size`] and [`spec`] (what a model is made of, and every parameter by name), [`positions`] (the fixed
 //! codes), [`batch`] (packed tokens), [`model`] (**the forward pass, top to bottom**), [`embedding`] (how modalities enter and
-//! leave), [`loss`], `activation_checkpointing` (gradients in little memory), [`names`] (the release's names of our parameters).
+//! leave), [`loss`], `activation_checkpointing` (gradients in little memory), `backward_in_parts` (gradients that are sent while
+//! others are computed), [`names`] (the release's names of our parameters).
 
 mod activation_checkpointing;
+mod backward_in_parts;
 pub mod batch;
 mod embedding;
 pub mod loss;

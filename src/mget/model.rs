@@ -20,7 +20,7 @@ pub struct Mget {
     compute: Compute,
     mask_token: Parameter,
     pub(super) encoder_embeddings: Embeddings,
-    decoder_embeddings: Heads,
+    pub(super) decoder_embeddings: Heads,
     pub(super) encoder: Vec<EncoderBlock>,
     pub(super) encoder_norm: LayerNorm,
     /// The only matrix with a bias.

@@ -1,11 +1,11 @@
 //! The loop of every training: steps, held-out losses, checkpoints, and a callback that sees all of it and may stop it.
 
+use super::trainer::checkpoint::Checkpoint;
 use super::trainer::{HeldOut, Objective, StepReport, Trainer, TrainingError};
 use super::validation::Score;
 use crate::engine::{Communicator, Parameters, RankError};
 use crate::flow::Flow;
 use std::collections::BTreeMap;
-use std::path::Path;
 
 /// How often a run looks at itself.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -50,28 +50,6 @@ pub enum Event<'a> {
     },
 }
 
-/// A training that can be written down.
-pub trait Checkpoint {
-    /// How many steps were taken.
-    fn step(&self) -> u64;
-
-    /// Writes everything that the next step depends on, besides settings, seed and data, into an empty directory.
-    ///
-    /// # Errors
-    /// When a file cannot be written.
-    fn save(&self, directory: &Path) -> Result<(), TrainingError>;
-}
-
-impl<O: Objective> Checkpoint for Trainer<O> {
-    fn step(&self) -> u64 {
-        self.progress().step
-    }
-
-    fn save(&self, directory: &Path) -> Result<(), TrainingError> {
-        Trainer::save(self, directory)
-    }
-}
-
 /// What is told of a run, and may stop it.
 pub type Callback<'a, E> = dyn FnMut(Event<'_>) -> Result<Flow, E> + 'a;
 
@@ -86,6 +64,14 @@ pub(super) fn progress<E: From<TrainingError>>(
         Flow::Continue => Ok(()),
         Flow::Stop => Err(TrainingError::Stopped.into()),
     }
+}
+
+/// Asks `callback` to keep the state.
+fn kept<O: Objective, E: From<TrainingError>>(
+    trainer: &Trainer<O>,
+    callback: &mut Callback<'_, E>,
+) -> Result<Flow, E> {
+    trainer.kept(|state| callback(Event::Checkpoint(state)))?
 }
 
 /// Every rank comes to the same decision: to stop where one of them is asked to.
@@ -149,7 +135,7 @@ pub fn fit<O: Objective, E: From<TrainingError> + std::fmt::Display>(
     let mut stop = agreed(&ranks, callback(start))?;
     while trainer.progress().step < total {
         if stop {
-            agreed(&ranks, callback(Event::Checkpoint(trainer)))?;
+            agreed(&ranks, kept(trainer, callback))?;
             return Err(TrainingError::Stopped.into());
         }
         let step = trainer.progress().step;
@@ -165,7 +151,7 @@ pub fn fit<O: Objective, E: From<TrainingError> + std::fmt::Display>(
             stop |= validated(trainer, callback)?.1;
         }
         if due(intervals.checkpoint_every) && !stop {
-            stop |= agreed(&ranks, callback(Event::Checkpoint(trainer)))?;
+            stop |= agreed(&ranks, kept(trainer, callback))?;
         }
     }
     let (last, _) = validated(trainer, callback)?;

@@ -4,6 +4,7 @@ use super::schedule::Schedule;
 use super::settings::TrainingSettings;
 use super::trainer::{MicroStep, Objective, Progress, Trainer, TrainingError};
 use crate::engine::Gradients;
+use crate::engine::gradients::Complete;
 use crate::mget::{Batch, Loss, LossValues, Mget};
 
 /// MGET, trained to predict target tokens from input tokens and raw video.
@@ -35,9 +36,21 @@ impl Trainer<MaskedPrediction> {
 
 impl MaskedPrediction {
     /// The losses of a batch, and the gradients of `share` times their total, if it has any.
-    fn gradients(&self, batch: &Batch, share: f64) -> (LossValues, Option<Gradients>) {
+    fn gradients(
+        &self,
+        batch: &Batch,
+        share: f64,
+        complete: Option<&mut Complete<'_>>,
+    ) -> (LossValues, Option<Gradients>) {
+        let (model, loss) = (&self.model, self.loss);
         if self.activation_checkpointing {
-            return self.model.recomputed(batch, self.loss, share);
+            return match complete {
+                Some(complete) => model.recomputed(batch, loss, share, complete),
+                None => model.recomputed(batch, loss, share, &mut |_, _| ()),
+            };
+        }
+        if let Some(complete) = complete {
+            return model.gradients_in_parts(batch, loss, share, complete);
         }
         let losses = self.model.losses(batch, self.loss);
         let total = losses.total.clone();
@@ -62,8 +75,17 @@ impl Objective for MaskedPrediction {
         &mut self.model
     }
 
-    fn micro_step(&self, batch: &Batch, share: f64) -> Result<MicroStep<()>, TrainingError> {
-        let (values, gradients) = self.gradients(batch, share);
+    fn backward_order(&self) -> Vec<String> {
+        self.model.backward_order()
+    }
+
+    fn micro_step(
+        &self,
+        batch: &Batch,
+        share: f64,
+        complete: Option<&mut Complete<'_>>,
+    ) -> Result<MicroStep<()>, TrainingError> {
+        let (values, gradients) = self.gradients(batch, share, complete);
         let modalities = self.model.spec().modalities.iter().zip(values.modalities);
         Ok(MicroStep {
             loss: values.total,

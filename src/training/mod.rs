@@ -2,7 +2,7 @@
 //!
 //! Read in this order: [`settings`], [`source`] (where tokens come from), [`sampler`] (which clip stands where), [`loader`]
 //! (batches prepared ahead), [`trainer`] (**one step, and the state between steps**), [`trainer::ranks`] (a step on several
-//! processes), [`mod@fit`] (the loop), [`validation`], [`optimizer`], [`schedule`]. Trained are [`mget`] and [`tokenizer`]s;
+//! processes), [`trainer::checkpoint`], [`mod@fit`] (the loop), [`validation`], [`optimizer`], [`schedule`]. Trained are [`mget`] and [`tokenizer`]s;
 //! [`kmeans`] is what the latter have to beat. [`mget_fit`] and [`tokenizer_fit`] are the way from clips to a model; a [`mixture`]
 //! is what a tokenizer learns from.
 //!
@@ -34,7 +34,7 @@ pub mod validation;
 pub mod video_kmeans;
 
 pub use crate::flow::Flow;
-pub use fit::{Callback, Checkpoint, Event, Intervals, fit};
+pub use fit::{Callback, Event, Intervals, fit};
 pub use loader::{BatchSource, Loader};
 pub use mget::MaskedPrediction;
 pub use mget_fit::{FittedMget, MgetFit, TrainOptions};
@@ -46,6 +46,7 @@ pub use settings::{DatasetSize, Duration, Keep, TrainingSettings};
 pub use shards::Shards;
 pub use source::{DataError, InMemory, TokenSample, TokenSource};
 pub use tokenizer_fit::{FittedTokenizer, TokenizerFit, TokenizerOptions};
+pub use trainer::checkpoint::{Checkpoint, Snapshot};
 pub use trainer::ranks::Ranks;
 pub use trainer::{HeldOut, Objective, Progress, StepReport, Trainer, TrainingError};
 pub use validation::{Score, Unigram, Validation};

@@ -2,6 +2,9 @@
 //!
 //! Weight decay applies to everything but norms and biases. A parameter that took no part in a step has a zero gradient, not a
 //! missing one: its moments fade and its values decay.
+//!
+//! Of several ranks each may keep the moments of its stretch of the parameters alone ([`AdamW::shard`]). It moves that stretch, and the
+//! ranks tell each other what became of theirs; every number comes out as if one rank had moved all of them.
 
 use std::collections::BTreeMap;
 
@@ -10,9 +13,13 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::muon;
+use crate::engine::communicator::shard::Shard;
 use crate::engine::ops::{self, AdamWStep, Norm};
 use crate::engine::parameters::{Kind, to_host};
-use crate::engine::{EngineError, Gradients, HostTensor, Parameters, Values, Weights};
+use crate::engine::{
+    Communicator, Device, EngineError, Gradients, HostTensor, Parameters, RankError, Values,
+    Weights,
+};
 
 /// How the optimizer steps.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -26,7 +33,11 @@ pub struct AdamWSettings {
     pub weight_decay: f64,
     /// Largest norm of all gradients together, above 0; larger ones are scaled down. `null`: no limit.
     pub clip_norm: Option<f64>,
-    /// Muon for the matrices inside blocks: their momentum is made orthogonal first. Everything else steps as before.
+    /// Of several ranks each keeps its share of the optimizer's two moments and no more (ZeRO stage 1): less memory, one more
+    /// exchange of all weights a step, and the same bytes. One rank keeps everything.
+    pub shard: bool,
+    /// Muon for the matrices inside blocks: their momentum is made orthogonal first. Everything else steps as before. Not with `shard`:
+    /// the step of a matrix needs all of it.
     pub muon: bool,
 }
 
@@ -37,6 +48,7 @@ impl Default for AdamWSettings {
             epsilon: 1e-8,
             weight_decay: 0.05,
             clip_norm: Some(1.0),
+            shard: false,
             muon: false,
         }
     }
@@ -56,6 +68,7 @@ impl AdamWSettings {
                 self.weight_decay.is_finite() && self.weight_decay >= 0.0,
             ),
             ("clip_norm", self.clip_norm.is_none_or(positive)),
+            ("muon", !(self.muon && self.shard)),
         ];
         good.into_iter()
             .find(|(_, good)| !good)
@@ -70,7 +83,7 @@ pub fn decays(name: &str) -> bool {
     !(name.contains("norm.") || name.contains(".norm") || is_bias)
 }
 
-/// Means of gradients and of their squares, flat.
+/// Means of gradients and of their squares, flat; where the state is shared, of this rank's part of the parameter.
 #[derive(Debug, Clone)]
 struct Moments {
     mean: Tensor<1>,
@@ -78,12 +91,15 @@ struct Moments {
     square: Option<Tensor<1>>,
 }
 
-/// The optimizer and its state.
+/// The optimizer and its state, or this rank's share of it.
 #[derive(Debug, Clone)]
 pub struct AdamW {
     settings: AdamWSettings,
     step: u64,
     moments: BTreeMap<String, Moments>,
+    shard: Option<Shard>,
+    /// The values of this rank's stretch after a step, until the others have them too.
+    moved: Vec<f32>,
 }
 
 /// A step that was refused; nothing has changed.
@@ -117,7 +133,35 @@ impl AdamW {
             settings,
             step: 0,
             moments,
+            shard: None,
+            moved: Vec::new(),
         }
+    }
+
+    /// Where the settings ask for it and there are several ranks, keeps this rank's share of the state alone. Before the first step.
+    #[must_use]
+    pub fn shard<M: Parameters + ?Sized>(mut self, ranks: &Communicator, model: &M) -> Self {
+        self.shard = Shard::of(ranks, model).filter(|_| self.settings.shard);
+        if let Some(shard) = &self.shard {
+            let all = std::mem::take(&mut self.moments).into_iter();
+            let own = all.filter_map(|(name, moments)| {
+                let (own, _) = shard.own(&name)?;
+                let zeros = Tensor::zeros([own.len()], &moments.mean.device());
+                let pair = Moments {
+                    mean: zeros.clone(),
+                    square: Some(zeros),
+                };
+                Some((name, pair))
+            });
+            self.moments = own.collect();
+        }
+        self
+    }
+
+    /// Whether this rank has a share of the state, and not all of it.
+    #[must_use]
+    pub fn is_sharded(&self) -> bool {
+        self.shard.is_some()
     }
 
     /// How many steps were taken.
@@ -126,7 +170,8 @@ impl AdamW {
         self.step
     }
 
-    /// Clips `gradients` by their global norm, and moves the parameters of `model`. Gives the norm before clipping.
+    /// Clips `gradients` by their global norm, and moves the parameters of `model`. Gives the norm before clipping. Where the state is
+    /// sharded, nothing has moved before [`AdamW::gather`].
     ///
     /// # Errors
     /// When the norm is not finite. Nothing has changed then.
@@ -161,7 +206,50 @@ impl AdamW {
             rate: rate / (1.0 - settings.betas[0].powi(exponent)),
             square_correction: 1.0 / (1.0 - settings.betas[1].powi(exponent)).sqrt(),
         };
+        let decay = |name: &str| {
+            if decays(name) {
+                rate * settings.weight_decay
+            } else {
+                0.0
+            }
+        };
         let moments = &mut self.moments;
+        if let Some(shard) = &self.shard {
+            // A device refuses a step by itself, but what it would have to tell is read anyway.
+            let norm_now = norm.read();
+            if !norm_now.is_finite() {
+                self.step -= 1;
+                return Err(NotFinite {
+                    step: self.step + 1,
+                    norm: norm_now,
+                });
+            }
+            self.moved = vec![0.0; shard.stretch()];
+            let moved = &mut self.moved;
+            model.visit("", &mut |name, parameter| {
+                let (Some(state), Some((own, at))) = (moments.remove(name), shard.own(name)) else {
+                    return;
+                };
+                let square = state.square.expect("Muon is not for shares");
+                let gradient = gradients
+                    .remove(name)
+                    .expect("one gradient per trainable parameter");
+                step.decay = decay(name);
+                let length = own.len();
+                let (values, mean, square) = ops::adamw(
+                    parameter.untracked().slice([own.clone()]),
+                    gradient.slice([own]),
+                    state.mean,
+                    square,
+                    &norm,
+                    step,
+                );
+                moved[at..at + length].copy_from_slice(&to_host(values));
+                let square = Some(square);
+                moments.insert(name.to_owned(), Moments { mean, square });
+            });
+            return Ok(norm_now);
+        }
         model.visit_mut("", &mut |name, parameter| {
             let Some(state) = moments.remove(name) else {
                 return;
@@ -169,11 +257,7 @@ impl AdamW {
             let gradient = gradients
                 .remove(name)
                 .expect("one gradient per trainable parameter");
-            step.decay = if decays(name) {
-                rate * settings.weight_decay
-            } else {
-                0.0
-            };
+            step.decay = decay(name);
             let tracked = parameter.is_tracked();
             let moved = if let Some(square) = state.square {
                 let (values, mean, square) =
@@ -214,64 +298,133 @@ impl AdamW {
         Ok(norm)
     }
 
-    /// The state as arrays: `step`, `exp_avg.<name>` and, where Muon does not step, `exp_avg_sq.<name>`.
-    #[must_use]
-    pub fn state(&self) -> Weights {
+    /// Ends a step where the state is sharded: every rank gets from all what they have moved. Does nothing where it is not.
+    ///
+    /// # Errors
+    /// When a rank is lost.
+    ///
+    /// # Panics
+    /// When `model` is not of the optimizer.
+    pub fn gather<M: Parameters + ?Sized>(&mut self, model: &mut M) -> Result<(), RankError> {
+        let Some(shard) = &self.shard else {
+            return Ok(());
+        };
+        let all = shard.collect(&std::mem::take(&mut self.moved), true)?;
+        model.visit_mut("", &mut |name, parameter| {
+            if let Some(place) = shard.place(name) {
+                parameter.set(all[place].to_vec());
+            }
+        });
+        Ok(())
+    }
+
+    /// The state as arrays: `step`, `exp_avg.<name>` and, where Muon does not step, `exp_avg_sq.<name>`, the same however many ranks share it. Where it is sharded, all
+    /// ranks must ask at once, and rank 0 alone gets it; the others get `None`.
+    ///
+    /// # Errors
+    /// When a rank is lost.
+    pub fn state(&self) -> Result<Option<Weights>, RankError> {
         let mut weights = Weights::default();
         let step = HostTensor {
             shape: vec![1],
             values: Values::I64(vec![self.step as i64]),
         };
         weights.tensors.insert("step".to_owned(), step);
-        for (name, moments) in &self.moments {
-            let square = moments.square.as_ref().map(|s| ("exp_avg_sq", s));
-            for (kind, tensor) in [("exp_avg", &moments.mean)].into_iter().chain(square) {
-                let values = to_host(tensor.clone());
+        let kinds: [(&str, fn(&Moments) -> Option<&Tensor<1>>); 2] = [
+            ("exp_avg", |m| Some(&m.mean)),
+            ("exp_avg_sq", |m| m.square.as_ref()),
+        ];
+        for (kind, of) in kinds {
+            let mut insert = |name: &str, values: Vec<f32>| {
                 let length = values.len();
                 weights.insert_f32(&format!("{kind}.{name}"), values, &[length]);
+            };
+            let Some(shard) = &self.shard else {
+                for (name, moments) in &self.moments {
+                    if let Some(values) = of(moments) {
+                        insert(name, to_host(values.clone()));
+                    }
+                }
+                continue;
+            };
+            let mut mine = vec![0.0; shard.stretch()];
+            for (name, moments) in &self.moments {
+                if let (Some((own, at)), Some(values)) = (shard.own(name), of(moments)) {
+                    let values = to_host(values.clone());
+                    mine[at..at + own.len()].copy_from_slice(&values);
+                }
+            }
+            let all = shard.collect(&mine, shard.is_root())?;
+            for (name, _) in shard.names().filter(|_| shard.is_root()) {
+                let place = shard.place(name).unwrap_or_default();
+                insert(name, all[place].to_vec());
             }
         }
-        weights
+        let whole = self.shard.as_ref().is_none_or(Shard::is_root);
+        Ok(whole.then_some(weights))
     }
 
-    /// Continues from a state of [`AdamW::state`]; the next steps are those the stored optimizer would have taken, to the bit.
+    /// Continues from a state of [`AdamW::state`], of any number of ranks; the next steps are those the stored optimizer would have
+    /// taken, to the bit.
     ///
     /// # Errors
     /// When the state is of another model.
     pub fn restore(&mut self, state: &Weights) -> Result<(), EngineError> {
         let step = state.get("step", &[1])?.i64("step")?[0];
+        let names: Vec<(String, usize)> = match &self.shard {
+            Some(shard) => {
+                let names = shard.names();
+                names
+                    .map(|(name, length)| (name.to_owned(), length))
+                    .collect()
+            }
+            None => {
+                let all = self.moments.iter();
+                let length = |moments: &Moments| moments.mean.dims()[0];
+                all.map(|(name, moments)| (name.clone(), length(moments)))
+                    .collect()
+            }
+        };
         let mut restored = BTreeMap::new();
         let mut arrays = 1;
-        for (name, moments) in &self.moments {
-            let read = |kind: &str, like: &Tensor<1>| -> Result<Tensor<1>, EngineError> {
+        for (name, length) in &names {
+            // What other ranks keep must be there too.
+            let read = |kind: &str| {
                 let name = format!("{kind}.{name}");
-                let values = state.get(&name, &like.dims())?.f32(&name)?.to_vec();
-                let length = values.len();
-                Ok(Tensor::from_data(
-                    TensorData::new(values, [length]),
-                    &like.device(),
-                ))
+                state.get(&name, &[*length])?.f32(&name)
             };
+            let with_muon = self.moments.get(name).is_some_and(|m| m.square.is_none());
+            let mean = read("exp_avg")?;
+            let square = if with_muon {
+                None
+            } else {
+                Some(read("exp_avg_sq")?)
+            };
+            arrays += 1 + usize::from(square.is_some());
+            let Some(moments) = self.moments.get(name) else {
+                continue;
+            };
+            let own = self.shard.as_ref().and_then(|shard| shard.own(name));
+            let own = own.map_or(0..*length, |(own, _)| own);
+            let device = moments.mean.device();
             let pair = Moments {
-                mean: read("exp_avg", &moments.mean)?,
-                square: match &moments.square {
-                    Some(square) => Some(read("exp_avg_sq", square)?),
-                    None => None,
-                },
+                mean: flat(&mean[own.clone()], &device),
+                square: square.map(|square| flat(&square[own], &device)),
             };
-            arrays += 1 + usize::from(pair.square.is_some());
             restored.insert(name.clone(), pair);
         }
         let unknown = state.tensors.len().saturating_sub(arrays);
         if unknown > 0 {
+            let known = |key: &str| {
+                let name = key.split_once('.').map_or("", |parts| parts.1);
+                names.iter().any(|(known, _)| known == name)
+            };
             return Err(EngineError::Unknown {
                 count: unknown,
                 first: state
                     .tensors
                     .keys()
-                    .find(|key| {
-                        !restored.contains_key(key.split_once('.').map_or("", |parts| parts.1))
-                    })
+                    .find(|key| !known(key))
                     .cloned()
                     .unwrap_or_default(),
             });
@@ -280,6 +433,10 @@ impl AdamW {
         self.moments = restored;
         Ok(())
     }
+}
+
+fn flat(values: &[f32], device: &Device) -> Tensor<1> {
+    Tensor::from_data(TensorData::new(values.to_vec(), [values.len()]), device)
 }
 
 #[cfg(test)]
@@ -297,6 +454,7 @@ mod tests {
             let y = model.forward(x.without_autodiff().reshape([1, 3]));
             let gradients = Gradients::of(&y.square().sum(), model);
             optimizer.step(model, gradients, 0.01).unwrap();
+            optimizer.gather(model).unwrap();
         }
     }
 
@@ -307,7 +465,10 @@ mod tests {
         model.start_training();
         let mut optimizer = AdamW::new(AdamWSettings::default(), &model);
         train(&mut model, &mut optimizer, 0..3);
-        let (weights, state) = (model.weights(), optimizer.state().to_bytes());
+        let (weights, state) = (
+            model.weights(),
+            optimizer.state().unwrap().unwrap().to_bytes(),
+        );
         train(&mut model, &mut optimizer, 3..6);
 
         let mut again = Linear::new(&Initialise::empty(&compute), 3, 2, true);
@@ -320,7 +481,74 @@ mod tests {
         assert_eq!(resumed.steps(), 3);
         train(&mut again, &mut resumed, 3..6);
         assert_eq!(again.weights().to_bytes(), model.weights().to_bytes());
-        assert_eq!(resumed.state().to_bytes(), optimizer.state().to_bytes());
+        assert_eq!(
+            resumed.state().unwrap().unwrap().to_bytes(),
+            optimizer.state().unwrap().unwrap().to_bytes()
+        );
+    }
+
+    /// A state that was sharded over some ranks goes on over others, and comes out as one that never was.
+    #[test]
+    fn ranks_that_share_the_state_move_every_number_as_one_does() {
+        let settings = |shard| AdamWSettings {
+            shard,
+            ..AdamWSettings::default()
+        };
+        let model = || {
+            let mut model = Linear::new(&Initialise::new(&Compute::cpu(), 1), 3, 2, true);
+            model.start_training();
+            model
+        };
+        let (mut expected, mut whole) = (model(), AdamW::new(settings(false), &model()));
+        train(&mut expected, &mut whole, 0..3);
+        let half = (
+            expected.weights(),
+            whole.state().unwrap().unwrap().to_bytes(),
+        );
+        train(&mut expected, &mut whole, 3..6);
+        let on = |size: usize, from: Option<&(Weights, Vec<u8>)>, steps: std::ops::Range<u64>| {
+            let work = |ranks: &Communicator| {
+                let mut model = model();
+                let mut optimizer = AdamW::new(settings(true), &model).shard(ranks, &model);
+                assert_eq!(optimizer.is_sharded(), size > 1);
+                if let Some((weights, state)) = from {
+                    model.load(weights).unwrap();
+                    let state = Weights::from_bytes(state).unwrap();
+                    optimizer.restore(&state).unwrap();
+                }
+                let kept = optimizer.moments.values();
+                let kept: usize = kept.map(|moments| moments.mean.dims()[0]).sum();
+                assert!(
+                    kept <= 8_usize.div_ceil(size),
+                    "{kept} of 8 on {size} ranks"
+                );
+                train(&mut model, &mut optimizer, steps.clone());
+                let state = optimizer.state().unwrap();
+                (model.weights(), state.map(|state| state.to_bytes()))
+            };
+            let mut all = std::thread::scope(|scope| {
+                let work = &work;
+                let threads = Communicator::threads(size).into_iter();
+                let threads: Vec<_> = threads
+                    .map(|ranks| scope.spawn(move || work(&ranks)))
+                    .collect();
+                let ended = threads.into_iter().map(|thread| thread.join().unwrap());
+                ended.collect::<Vec<_>>()
+            });
+            let (weights, state) = all.swap_remove(0);
+            assert!(all.iter().all(|other| *other == (weights.clone(), None)));
+            (weights, state.unwrap())
+        };
+        let last = (
+            expected.weights(),
+            whole.state().unwrap().unwrap().to_bytes(),
+        );
+        for size in 1..5 {
+            let found = on(size, None, 0..3);
+            assert!(found == half, "{size} ranks");
+            let found = on(5 - size, Some(&found), 3..6);
+            assert!(found == last, "{size} ranks, then others");
+        }
     }
 
     #[test]

@@ -16,6 +16,7 @@ use super::trainer::{MicroStep, Objective, Progress, Trainer, TrainingError};
 use super::validation::Score;
 use crate::clip::Signal;
 use crate::engine::communicator::reduce::Reduction;
+use crate::engine::gradients::Complete;
 use crate::engine::parameters::to_host;
 use crate::engine::{Communicator, Gradients, Parameters};
 use crate::geometry::skeleton::HAND;
@@ -266,6 +267,7 @@ impl Objective for VqReconstruction {
         &self,
         signals: &Vec<Prepared>,
         share: f64,
+        _: Option<&mut Complete<'_>>,
     ) -> Result<MicroStep<Assignment>, TrainingError> {
         let trained = self.model.forward_training(&batch(&self.model, signals));
         let weight = self.model.settings().commitment_weight;
@@ -372,7 +374,12 @@ impl Objective for VideoReconstruction {
         self.model.network_mut()
     }
 
-    fn micro_step(&self, clips: &Vec<Signal>, share: f64) -> Result<MicroStep<()>, TrainingError> {
+    fn micro_step(
+        &self,
+        clips: &Vec<Signal>,
+        share: f64,
+        _: Option<&mut Complete<'_>>,
+    ) -> Result<MicroStep<()>, TrainingError> {
         if clips.is_empty() {
             return Err(TrainingError::NoData);
         }

@@ -3,6 +3,7 @@
 //! What differs is an [`Objective`]: the module, its loss on a micro-batch, and what a step changes that no gradient does
 //! (codebooks). Everything a step does is a function of the seed, the step and the state.
 
+pub mod checkpoint;
 pub mod ranks;
 
 use self::ranks::{Ranks, ShareError, Told};
@@ -11,6 +12,7 @@ use super::schedule::{Schedule, ScheduleError};
 use super::settings::{Keep, SettingsError};
 use super::source::DataError;
 use super::validation::Score;
+use crate::engine::gradients::Complete;
 use crate::engine::{EngineError, Gradients, Parameters, RankError, Weights};
 use crate::formats::ReadError;
 use crate::masking::MaskingError;
@@ -19,7 +21,7 @@ use crate::model::ModelError;
 use crate::tokenizer::TokenizerError;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 /// What is trained, and what it is trained to do.
 pub trait Objective {
@@ -36,7 +38,8 @@ pub trait Objective {
     /// The module, to be changed by the optimizer or a checkpoint.
     fn module_mut(&mut self) -> &mut Self::Module;
 
-    /// The loss of a micro-batch, and the gradients of `share` times it; changes nothing.
+    /// The loss of a micro-batch, and the gradients of `share` times it; changes nothing. `complete`, where there is one, may hear of
+    /// gradients as soon as backward is done with them, so that they are sent while it goes on.
     ///
     /// # Errors
     /// When the batch does not fit the module.
@@ -44,7 +47,17 @@ pub trait Objective {
         &self,
         batch: &Self::Batch,
         share: f64,
+        complete: Option<&mut Complete<'_>>,
     ) -> Result<MicroStep<Self::Trace>, TrainingError>;
+
+    /// The names of the parameters, about in the order in which backward completes their gradients.
+    fn backward_order(&self) -> Vec<String> {
+        let mut names = Vec::new();
+        self.module()
+            .visit("", &mut |name, _| names.push(name.to_owned()));
+        names.reverse();
+        names
+    }
 
     /// What the step changes besides what the gradients did, after the optimizer; `step` is counted from 0. Returns further
     /// numbers for the report.
@@ -278,7 +291,9 @@ impl<O: Objective> Trainer<O> {
     pub fn shared(mut self, ranks: Ranks, micro_batch: usize) -> Result<Self, ShareError> {
         let batch = self.micro_batches.iter().sum();
         self.micro_batches = ranks.micro_batches(batch, micro_batch)?;
-        self.ranks = ranks;
+        let (optimizer, model) = (self.optimizer, self.objective.module());
+        self.optimizer = optimizer.shard(ranks.communicator(), model);
+        self.ranks = ranks.in_order(self.objective.backward_order());
         Ok(self)
     }
 
@@ -303,10 +318,10 @@ impl<O: Objective> Trainer<O> {
             .map(|n| *n as f64 / samples as f64)
             .collect();
         let objective = &self.objective;
-        let micro_step = |index: usize| -> Result<_, E> {
+        let micro_step = |index: usize, complete: Option<&mut Complete<'_>>| -> Result<_, E> {
             let batch = next(index)?;
             // The loss of a step is the mean over its micro-batches, as in the reference.
-            let micro = objective.micro_step(&batch, shares[index])?;
+            let micro = objective.micro_step(&batch, shares[index], complete)?;
             Ok(micro)
         };
         let (step, model) = (self.progress.step, objective.module());
@@ -329,6 +344,9 @@ impl<O: Objective> Trainer<O> {
         let gradient_norm = self
             .optimizer
             .step(self.objective.module_mut(), gradients, learning_rate)
+            .map_err(TrainingError::from)?;
+        self.optimizer
+            .gather(self.objective.module_mut())
             .map_err(TrainingError::from)?;
         self.ranks.note(gradient_norm);
         let further = self.objective.finish_step(traces, self.progress.step);
@@ -405,69 +423,6 @@ impl<O: Objective> Trainer<O> {
     #[must_use]
     pub fn micro_batches(&self) -> &[usize] {
         &self.micro_batches
-    }
-
-    /// Writes everything that the next step depends on, besides settings, seed and data, into an empty directory.
-    ///
-    /// # Errors
-    /// When a file cannot be written.
-    pub fn save(&self, directory: &Path) -> Result<(), TrainingError> {
-        let weights = self.objective.module().weights();
-        weights.write(&directory.join(WEIGHTS))?;
-        self.optimizer.state().write(&directory.join(OPTIMIZER))?;
-        if let Some(best) = &self.best {
-            let path = directory.join(BEST);
-            let text = serde_json::to_string(&best.held_out).map_err(|e| damaged(&path, &e))?;
-            let mut weights = best.weights.clone();
-            weights.metadata.insert(HELD_OUT.to_owned(), text);
-            weights.write(&path)?;
-        }
-        let path = directory.join(PROGRESS);
-        let text =
-            serde_json::to_vec_pretty(&self.progress).map_err(|error| damaged(&path, &error))?;
-        std::fs::write(&path, text).map_err(|error| TrainingError::Write { path, error })
-    }
-
-    /// Continues from a directory of [`Trainer::save`]: the next steps are those the stored run would have taken, to the bit.
-    ///
-    /// # Errors
-    /// When the directory is damaged or of another model.
-    pub fn resume(&mut self, directory: &Path) -> Result<(), TrainingError> {
-        let path = directory.join(PROGRESS);
-        let text = std::fs::read(&path).map_err(|error| damaged(&path, &error))?;
-        let progress: Progress =
-            serde_json::from_slice(&text).map_err(|error| damaged(&path, &error))?;
-        let path = directory.join(BEST);
-        let best = if self.keep == Keep::Best && path.is_file() {
-            let mut weights = Weights::read(&path)?;
-            let text = weights.metadata.remove(HELD_OUT).unwrap_or_default();
-            let held_out = serde_json::from_str(&text).map_err(|error| damaged(&path, &error))?;
-            self.objective.module().check_shapes(&weights)?;
-            Some(Best { held_out, weights })
-        } else {
-            None
-        };
-        let weights = Weights::read(&directory.join(WEIGHTS))?;
-        self.optimizer
-            .restore(&Weights::read(&directory.join(OPTIMIZER))?)?;
-        self.objective.module_mut().load(&weights)?;
-        self.progress = progress;
-        self.best = best;
-        Ok(())
-    }
-}
-
-const WEIGHTS: &str = "weights.safetensors";
-const OPTIMIZER: &str = "optimizer.safetensors";
-const BEST: &str = "best.safetensors";
-const PROGRESS: &str = "progress.json";
-/// The key of the held-out losses in the metadata of [`BEST`].
-const HELD_OUT: &str = "held_out";
-
-fn damaged(path: &Path, reason: &dyn std::fmt::Display) -> TrainingError {
-    TrainingError::Checkpoint {
-        path: path.to_path_buf(),
-        reason: reason.to_string(),
     }
 }
 

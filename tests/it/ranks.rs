@@ -150,6 +150,70 @@ fn the_same_number_of_ranks_trains_to_the_same_bytes_and_others_to_rounding() {
 }
 
 #[test]
+fn ranks_that_share_the_optimizer_s_state_train_to_the_same_bytes_and_checkpoints_are_those_of_one()
+{
+    let folder = tempfile::tempdir().unwrap();
+    for (reduction, micro_batch) in [(Reduction::Ordered, 1), (Reduction::Fast, 2)] {
+        let settings = settings(reduction, micro_batch);
+        let mut sharded = settings.clone();
+        sharded.optimizer.shard = true;
+        for size in [2, 3, 4] {
+            if reduction == Reduction::Fast && size == 4 {
+                continue;
+            }
+            let name = |what: &str| folder.path().join(format!("{reduction:?} {size} {what}"));
+            let (own, other) = (name("sharded"), name("whole"));
+            let expected = together(size, &settings, &other, None);
+            assert_eq!(
+                together(size, &sharded, &own, None),
+                expected,
+                "{size} ranks"
+            );
+            for file in [
+                "weights.safetensors",
+                "optimizer.safetensors",
+                "progress.json",
+            ] {
+                let read = |run: &Path| std::fs::read(run.join("5").join(file)).unwrap();
+                assert!(read(&own) == read(&other), "{size} ranks: {file}");
+            }
+            if reduction == Reduction::Ordered {
+                let checkpoint = own.join("5");
+                let resumed = together(6 - size, &sharded, &own, Some(&checkpoint));
+                assert_eq!(
+                    resumed.weights, expected.weights,
+                    "{size} ranks, then others"
+                );
+                let alone = train(
+                    Communicator::alone(),
+                    &sharded,
+                    &name("alone"),
+                    Some(checkpoint),
+                );
+                assert_eq!(alone.unwrap().weights, expected.weights, "then one");
+            }
+        }
+    }
+}
+
+/// With activation checkpointing a block's gradients are complete as well while backward goes on.
+#[test]
+fn activation_checkpointing_trains_to_the_same_bytes_on_any_number_of_ranks() {
+    let settings = TrainingSettings {
+        activation_checkpointing: true,
+        steps: Some(3),
+        checkpoint_every: 0,
+        ..settings(Reduction::Ordered, 1)
+    };
+    let folder = tempfile::tempdir().unwrap();
+    let expected = train(Communicator::alone(), &settings, folder.path(), None).unwrap();
+    for size in [2, 3] {
+        let found = together(size, &settings, folder.path(), None);
+        assert_eq!(found, expected, "{size} ranks");
+    }
+}
+
+#[test]
 fn a_batch_that_does_not_divide_is_refused_with_the_way_out() {
     let refused = |reduction, micro_batch, size: usize| {
         let settings = settings(reduction, micro_batch);

@@ -86,6 +86,7 @@ pub(super) fn run(
         batch: settings.training.batch,
         nominal: input + target,
         last: None,
+        checkpoints: checkpoint::Background::default(),
     };
     let fit = MgetFit {
         spec: spec.clone(),
@@ -112,7 +113,8 @@ pub(super) fn run(
         .map_err(|failure| match failure {
             Failure::Training(error) => input_error(error),
             Failure::Stage(error) => error,
-        })?;
+        });
+    let fitted = record.checkpoints.end(fitted)?;
     // Rank 0 alone writes.
     if !root {
         return Ok(Value::Null);
@@ -156,6 +158,7 @@ struct Record<'a> {
     nominal: usize,
     /// Totals and time of the step before.
     last: Option<(u64, f64)>,
+    checkpoints: checkpoint::Background,
 }
 
 impl Record<'_> {
@@ -187,9 +190,13 @@ impl Record<'_> {
                 }
             }
             Event::Validation(held_out) => held_out_losses(held_out, context)?,
-            Event::Checkpoint(state) => checkpoint::save(context, state.step(), |_, folder| {
-                state.save(folder).map_err(StageError::other)
-            })?,
+            Event::Checkpoint(state) => {
+                let snapshot = state.snapshot()?;
+                self.checkpoints
+                    .save(context, state.step(), move |folder| {
+                        snapshot.write(folder).map_err(StageError::other)
+                    })?;
+            }
             Event::Progress { .. } => {}
         }
         let stop = context.interrupted();

@@ -79,10 +79,11 @@ pub(super) fn run(
         seed: context.seed(),
         resume: resume.map(|(_, path)| path),
     };
+    let mut checkpoints = checkpoint::Background::default();
     let fitted = fit
         .run(&mut |event| {
             if root {
-                heard(event, having, settings, context)
+                heard(event, having, settings, &mut checkpoints, context)
             } else {
                 Ok(Flow::Continue)
             }
@@ -90,7 +91,8 @@ pub(super) fn run(
         .map_err(|failure: Failure| match failure {
             Failure::Training(error) => failed(error, settings),
             Failure::Stage(error) => error,
-        })?;
+        });
+    let fitted = checkpoints.end(fitted)?;
     // Rank 0 alone writes.
     if !root {
         return Ok(Value::Null);
@@ -149,6 +151,7 @@ fn heard(
     event: Event<'_>,
     signals: usize,
     settings: &TrainTokenizerSettings,
+    checkpoints: &mut checkpoint::Background,
     context: &mut dyn StageContext,
 ) -> Result<Flow, Failure> {
     match event {
@@ -171,9 +174,12 @@ fn heard(
             let loss = held_out.mean().map(|mean| ("validation/loss", mean));
             context.record(held_out.step, loss.as_slice())?;
         }
-        Event::Checkpoint(state) => checkpoint::save(context, state.step(), |_, folder| {
-            state.save(folder).map_err(StageError::other)
-        })?,
+        Event::Checkpoint(state) => {
+            let snapshot = state.snapshot()?;
+            checkpoints.save(context, state.step(), move |folder| {
+                snapshot.write(folder).map_err(StageError::other)
+            })?;
+        }
         Event::Progress { done, total, unit } => {
             context.progress(done as u64, total as u64, unit);
         }

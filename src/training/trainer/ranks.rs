@@ -2,12 +2,13 @@
 //!
 //! The unit of work is the micro-batch: rank `r` of `n` computes micro-batches `r`, `r + n`, ... Whatever is averaged or added
 //! over a step is folded in the order of micro-batches on every rank, so that the report, the running means of codebooks and
-//! the choice of dead codes are those of one rank. Gradients are added as [`Reduction`] says.
+//! the choice of dead codes are those of one rank. Gradients are added as [`Reduction`] says, while backward goes on.
 
 use super::super::settings::micro_batches;
 use super::{MicroStep, Progress, TrainingError};
 use crate::engine::communicator::reduce::{Reduction, Sum};
-use crate::engine::{Communicator, Gradients, Parameters, RankError};
+use crate::engine::gradients::Complete;
+use crate::engine::{Communicator, Gradients, Parameters, RankError, Tensor};
 use crate::tokenizer::quantizer::Assignment;
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -16,6 +17,8 @@ use std::sync::atomic::{AtomicU64, Ordering};
 pub struct Ranks {
     communicator: Communicator,
     reduction: Reduction,
+    /// The names of the parameters, about as backward completes their gradients.
+    order: Vec<String>,
     /// Of the gradient that this rank has stepped with last, as bits: all must have the same.
     norm: AtomicU64,
 }
@@ -24,6 +27,7 @@ impl Clone for Ranks {
     fn clone(&self) -> Self {
         Self {
             norm: AtomicU64::new(self.norm.load(Ordering::Relaxed)),
+            order: self.order.clone(),
             ..Self::new(self.communicator.clone(), self.reduction)
         }
     }
@@ -65,8 +69,15 @@ impl Ranks {
         Self {
             communicator,
             reduction,
+            order: Vec::new(),
             norm: AtomicU64::default(),
         }
+    }
+
+    /// Backward completes gradients about in this order: so they are sent.
+    #[must_use]
+    pub(in crate::training) fn in_order(self, order: Vec<String>) -> Self {
+        Self { order, ..self }
     }
 
     /// What they tell each other through.
@@ -112,7 +123,7 @@ impl Ranks {
     }
 
     /// Computes this rank's micro-batches of `step` and gives what all ranks found, in order, and the sum of their gradients, where
-    /// any asks for one.
+    /// any asks for one. The last micro-batch before ranks meet is told who wants to hear of its gradients.
     ///
     /// # Errors
     /// What `micro_step` says here or elsewhere, or when a rank is lost.
@@ -121,7 +132,7 @@ impl Ranks {
         step: u64,
         count: usize,
         model: &M,
-        mut micro_step: impl FnMut(usize) -> Result<MicroStep<T>, E>,
+        mut micro_step: impl FnMut(usize, Option<&mut Complete<'_>>) -> Result<MicroStep<T>, E>,
     ) -> Result<(Vec<MicroStep<T>>, Option<Gradients>), E>
     where
         M: Parameters,
@@ -130,37 +141,62 @@ impl Ranks {
     {
         let ranks = &self.communicator;
         let lost = |error: RankError| E::from(TrainingError::from(error));
-        let Some(mut sum) = Sum::new(ranks, model) else {
-            let mut own = None;
-            let micros: Result<Vec<_>, E> = (0..count)
-                .map(|index| take(micro_step(index), &mut own))
-                .collect();
-            return Ok((micros?, own));
-        };
-        ranks.stepping(true);
         let per_rank = count / ranks.size();
         // In the order of samples, ranks meet after each micro-batch.
         let rounds = match self.reduction {
             Reduction::Ordered => per_rank,
             Reduction::Fast => 1,
         };
+        let Some(mut sum) = Sum::new(ranks, model, &self.order, rounds) else {
+            let mut own = None;
+            let micros: Result<Vec<_>, E> = (0..count)
+                .map(|index| take(micro_step(index, None), &mut own))
+                .collect();
+            return Ok((micros?, own));
+        };
+        ranks.stepping(true);
         let mut own_indices = self.own(count);
         let mut all = Vec::new();
         let mut any = false;
         for _ in 0..rounds {
-            let mut own = None;
-            let micros: Result<Vec<MicroStep<T>>, E> = own_indices
-                .by_ref()
-                .take(per_rank / rounds)
-                .map(|index| take(micro_step(index), &mut own))
-                .collect();
-            let told = micros.as_ref().map_err(ToString::to_string);
-            let told = told.map(|micros| self.tell(step, micros, own.is_some()));
+            let mut own_indices = own_indices.by_ref().take(per_rank / rounds).peekable();
+            let mut round = || -> Result<Round<T>, E> {
+                let (mut earlier, mut micros) = (None, Vec::new());
+                while let Some(index) = own_indices.next() {
+                    if own_indices.peek().is_some() {
+                        micros.push(take(micro_step(index, None), &mut earlier)?);
+                        continue;
+                    }
+                    // What is complete is on its way while backward goes on.
+                    let mut complete = |name: &str, gradient: &Tensor<1>| {
+                        let earlier = earlier.as_ref().and_then(|all: &Gradients| all.get(name));
+                        sum.put(name, earlier, Some(gradient));
+                    };
+                    let micro = micro_step(index, Some(&mut complete));
+                    let mut last = None;
+                    micros.push(take(micro, &mut last)?);
+                    return Ok((micros, earlier, last));
+                }
+                Ok((micros, earlier, None))
+            };
+            let found = round();
+            let (earlier, last) = match &found {
+                Ok((_, earlier, last)) => (earlier.as_ref(), last.as_ref()),
+                // The others wait for buckets before they hear what went wrong here.
+                Err(_) => (None, None),
+            };
+            let ended = sum.end_round(earlier, last);
+            let told = found.as_ref().map_err(ToString::to_string);
+            let told = told.map(|(micros, earlier, last)| {
+                self.tell(step, micros, earlier.is_some() || last.is_some())
+            });
+            if let (Err(error), Ok(_)) = (ended, &found) {
+                return Err(lost(error));
+            }
             let gathered = ranks.gather(told);
-            micros?;
-            let gathered = gathered.map_err(lost)?;
+            drop(found?);
             let mut round = Vec::new();
-            for (rank, bytes) in gathered.iter().enumerate() {
+            for (rank, bytes) in gathered.map_err(lost)?.iter().enumerate() {
                 let (micros, has) = self.hear(step, rank, bytes).map_err(lost)?;
                 any |= has;
                 round.push(micros.into_iter());
@@ -168,11 +204,8 @@ impl Ranks {
             for _ in 0..per_rank / rounds {
                 all.extend(round.iter_mut().filter_map(Iterator::next));
             }
-            // A loss that is not finite ends the step on every rank; there is nothing to add.
-            if all.iter().all(|micro| micro.loss.is_finite()) {
-                sum.add(own).map_err(lost)?;
-            }
         }
+        // A loss that is not finite ends the step on every rank; nothing becomes of the sum.
         let finite = all.iter().all(|micro| micro.loss.is_finite());
         let gradients = if any && finite {
             Some(sum.finish(model).map_err(lost)?)
@@ -265,6 +298,9 @@ impl Ranks {
         Ok((micros, has))
     }
 }
+
+/// Of a rank's micro-batches before all meet: what they found, the sum of the gradients of all but the last, and those of the last.
+type Round<T> = (Vec<MicroStep<T>>, Option<Gradients>, Option<Gradients>);
 
 /// Takes the gradients of a micro-batch out and adds them; a batch that asks for nothing has none.
 fn take<T, E>(

@@ -5,7 +5,10 @@ use std::collections::BTreeMap;
 use burn::tensor::Tensor;
 
 use super::ops::Norm;
-use super::parameters::Parameters;
+use super::parameters::{Parameters, join};
+
+/// Hears of gradients that are complete while backward goes on with others: the parameter's name and its gradient, flat.
+pub type Complete<'a> = dyn FnMut(&str, &Tensor<1>) + 'a;
 
 /// One flat gradient per trainable parameter of a model. A parameter that took no part has a gradient of zeros, as in the
 /// reference: momentum and weight decay still move it.
@@ -60,12 +63,35 @@ impl Gradients {
 
     /// Gives every tracked parameter of `model` that has no gradient yet one of zeros.
     pub fn complete<M: Parameters + ?Sized>(&mut self, model: &M) {
-        model.visit("", &mut |name, parameter| {
-            if parameter.is_tracked() && !self.by_name.contains_key(name) {
-                let zeros = parameter.untracked().zeros_like();
-                self.by_name.insert(name.to_owned(), zeros);
+        self.close("", model, &mut |_, _| ());
+    }
+
+    /// Backward is done with `part`, whose names begin with `path`: its tracked parameters that have no gradient get one of zeros, and
+    /// `complete` hears of all of them.
+    pub fn close<M: Parameters + ?Sized>(
+        &mut self,
+        path: &str,
+        part: &M,
+        complete: &mut Complete<'_>,
+    ) {
+        part.visit(path, &mut |name, parameter| {
+            if parameter.is_tracked() {
+                let gradient = self.by_name.entry(name.to_owned());
+                let gradient = gradient.or_insert_with(|| parameter.untracked().zeros_like());
+                complete(name, gradient);
             }
         });
+    }
+
+    /// As [`Gradients::close`] for part `index` of a list at `path`.
+    pub fn close_item<M: Parameters + ?Sized>(
+        &mut self,
+        path: &str,
+        index: usize,
+        part: &M,
+        complete: &mut Complete<'_>,
+    ) {
+        self.close(&join(path, &index.to_string()), part, complete);
     }
 
     /// From flat tensors by name.

@@ -10,7 +10,7 @@
 //! * [`ops`]: linear, layer norm, attention over packed segments, GELU, SwiGLU, cross-entropy, convolution and frame norm of
 //!   video. On the CPU each is one fused operation with a hand-written backward; on other back ends it is unfused of the
 //!   library's own operations. Nearest code is a search on the host; embedding is the library's select everywhere;
-//! * [`gradients`]: gradients by parameter name, their global norm;
+//! * [`gradients`]: gradients by parameter name, their global norm, and who hears of them while backward goes on;
 //! * [`communicator`]: processes that train one model together;
 //! * [`memory`]: an allocator that uses the memory of one step again in the next.
 
@@ -27,7 +27,7 @@ pub mod weights;
 pub use burn::tensor::{Bool, Device, Int, Tensor};
 pub use communicator::{Communicator, RankError};
 pub use compute::{Compute, DeviceChoice, DeviceKind, Precision};
-pub use gradients::Gradients;
+pub use gradients::{Complete, Gradients};
 pub use initialise::Initialise;
 pub use parameters::{Parameter, Parameters, parameters};
 pub use segments::{Segment, Segments};

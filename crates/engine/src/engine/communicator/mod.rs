@@ -2,7 +2,8 @@
 //!
 //! [`Communicator`] is what the rooms above see: alone, ranks that are threads of this process (what tests train with), or MPI
 //! processes (feature `mpi`). Read in this order: this file; [`launch`], who started us and as what; [`reduce`], how gradients
-//! are added up; [`watch`], how a rank that is lost is found; `threads` and `mpi`, the two ways to carry bytes.
+//! are added up; [`shard`], who keeps which part of the optimizer's state; [`watch`], how a rank that is lost is found; `threads` and
+//! `mpi`, the two ways to carry bytes.
 //!
 //! Nothing is left to the library that carries the bytes: gradients are added here, in the order of ranks, so that what comes out
 //! does not depend on an implementation of MPI or on the algorithm it picks (measured: six algorithms of OpenMPI give three
@@ -12,10 +13,12 @@ pub mod launch;
 #[cfg(feature = "mpi")]
 mod mpi;
 pub mod reduce;
+pub mod shard;
 mod threads;
 pub mod watch;
 
 use serde::{Serialize, de::DeserializeOwned};
+use std::cell::RefCell;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::Receiver;
 use std::sync::{Arc, OnceLock};
@@ -105,6 +108,11 @@ impl std::fmt::Debug for Communicator {
 /// The ranks that this process was started among.
 static WORLD: OnceLock<Communicator> = OnceLock::new();
 
+thread_local! {
+    /// The rank that this thread is, where ranks are threads.
+    static THREAD: RefCell<Option<Communicator>> = const { RefCell::new(None) };
+}
+
 /// What stands first in every gathered message.
 const FINE: u8 = 0;
 const FAILED: u8 = 1;
@@ -119,7 +127,21 @@ impl Communicator {
     /// The ranks that this process was started among, once [`launch::launch`] has found them; alone before.
     #[must_use]
     pub fn world() -> Self {
-        WORLD.get().cloned().unwrap_or_default()
+        let thread = THREAD.with_borrow(Clone::clone);
+        thread.or_else(|| WORLD.get().cloned()).unwrap_or_default()
+    }
+
+    /// Does `work` as this rank: on this thread, [`Communicator::world`] is this one until it is done. For ranks that are threads.
+    pub fn enter<T>(&self, work: impl FnOnce() -> T) -> T {
+        /// Puts back what was there, also after a panic.
+        struct Before(Option<Communicator>);
+        impl Drop for Before {
+            fn drop(&mut self) {
+                THREAD.set(self.0.take());
+            }
+        }
+        let _before = Before(THREAD.replace(Some(self.clone())));
+        work()
     }
 
     /// Ranks that are threads of this process: one communicator for each.
@@ -338,6 +360,16 @@ mod tests {
         for message in found {
             assert_eq!(message, "rank 1 of 3: no shard 7");
         }
+    }
+
+    #[test]
+    fn a_thread_is_the_rank_that_it_has_entered_until_it_leaves() {
+        let found = on_ranks(2, |ranks| {
+            let inside =
+                ranks.enter(|| (Communicator::world().rank(), Communicator::world().size()));
+            (inside, Communicator::world().size())
+        });
+        assert_eq!(found, [((0, 2), 1), ((1, 2), 1)]);
     }
 
     #[test]

@@ -244,6 +244,7 @@ impl Thread {
     }
 
     fn exchange(&mut self, values: &[f32], answer: &Answer<Vec<f32>>) {
+        self.met += 1;
         let refuse = |error: &RankError| drop(answer.send(Err(error.clone())));
         let mut received = vec![0.0_f32; values.len()];
         mpi::request::scope(|scope| {
@@ -255,6 +256,7 @@ impl Thread {
     }
 
     fn collect(&mut self, values: &[f32], answer: &Answer<Vec<f32>>) {
+        self.met += 1;
         let refuse = |error: &RankError| drop(answer.send(Err(error.clone())));
         let mut received = vec![0.0_f32; values.len() * self.size];
         mpi::request::scope(|scope| {

@@ -1,19 +1,24 @@
-//! Gradients added up over ranks.
+//! Gradients added up over ranks, while backward goes on.
 //!
-//! Each bucket of a gradient is cut into as many parts as there are ranks; every rank gets its part from all, adds them in the
-//! order of ranks, and the sums are collected again: as many bytes on the wire as a ring, and one order of additions. Buckets
-//! are on their way while the next is packed.
+//! Parameters travel in buckets, in the order in which backward completes their gradients. Each bucket is cut into as many parts as
+//! there are ranks; every rank gets its part from all, adds them in the order of ranks, and the sums are collected again: as many
+//! bytes on the wire as a ring, and one order of additions. A thread of its own does that with a bucket as soon as it is full, so
+//! that it is on its way while backward fills the next.
+//!
+//! Which values a bucket has and when it is sent changes no bit of a sum: a number is added in the order of ranks wherever it lies.
 
-use super::{Communicator, Link, Pending, RankError};
+use super::{Communicator, Link, RankError};
 use crate::engine::{Gradients, Parameters, parameters::to_host};
 use burn::tensor::{Tensor, TensorData};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::sync::Arc;
+use std::sync::mpsc::{Receiver, Sender, channel};
+use std::thread::JoinHandle;
 
 /// Values on the wire at a time: 25 MiB, as PyTorch's buckets are.
-const BUCKET: usize = 25 * (1 << 20) / 4;
+pub(super) const BUCKET: usize = 25 * (1 << 20) / 4;
 
 /// In which order gradients of micro-batches are added over ranks. One rank always adds them in the order of samples.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
@@ -28,136 +33,300 @@ pub enum Reduction {
     Ordered,
 }
 
-/// A running sum over ranks, of which this one holds its parts.
+/// A sum over ranks, in rounds: each adds one gradient of every rank, in the order of ranks.
+#[derive(Debug)]
 pub struct Sum {
-    link: Arc<dyn Link>,
+    places: BTreeMap<String, Place>,
     buckets: Vec<Bucket>,
-    /// Parts of the buckets that were added so far.
-    parts: Option<Vec<Vec<f32>>>,
+    /// The first bucket of this round that was not sent yet.
+    next: usize,
+    full: Sender<Vec<Piece>>,
+    ended: Receiver<()>,
+    /// `None` once it was heard.
+    worker: Option<JoinHandle<Result<Vec<Vec<f32>>, RankError>>>,
 }
 
-/// Parameters that travel together, and how many values they have.
+/// Where the gradient of a parameter travels.
+#[derive(Debug)]
+struct Place {
+    bucket: usize,
+    start: usize,
+    length: usize,
+    /// It is in the bucket of this round.
+    there: bool,
+}
+
+/// Values that travel together.
+#[derive(Debug, Default)]
 struct Bucket {
-    parameters: Vec<(String, usize)>,
-    /// Values of one rank's part: all values, rounded up.
-    part: usize,
+    /// How many there are; on the wire they are padded to equal parts.
+    length: usize,
+    parameters: usize,
+    /// Of this round, as far as they are there.
+    pieces: Vec<Piece>,
+}
+
+/// This rank's gradient of one parameter.
+#[derive(Debug)]
+struct Piece {
+    /// Where it stands in its bucket, and how long it is.
+    start: usize,
+    length: usize,
+    /// Of all micro-batches but the last, and of the last; neither adds nothing.
+    earlier: Option<Tensor<1>>,
+    last: Option<Tensor<1>>,
+}
+
+impl Piece {
+    fn sum(&self) -> Option<Tensor<1>> {
+        match (&self.earlier, &self.last) {
+            (Some(sum), Some(more)) => Some(sum.clone() + more.clone()),
+            (sum, more) => sum.as_ref().or(more.as_ref()).cloned(),
+        }
+    }
+}
+
+/// The values of a bucket, on the host.
+fn packed(mut pieces: Vec<Piece>) -> Vec<f32> {
+    pieces.sort_unstable_by_key(|piece| piece.start);
+    let sums: Vec<Option<Tensor<1>>> = pieces.iter().map(Piece::sum).collect();
+    // One wait for a device, and not one for each parameter.
+    let all: Option<Vec<Tensor<1>>> = sums.iter().cloned().collect();
+    if let Some(all) = all.filter(|all| !all.is_empty()) {
+        return to_host(Tensor::cat(all, 0));
+    }
+    let mut values = Vec::new();
+    for (piece, sum) in pieces.iter().zip(sums) {
+        match sum {
+            Some(sum) => values.extend(to_host(sum)),
+            // x + -0.0 is x, also where x is -0.0: what adds nothing leaves no trace.
+            None => values.resize(values.len() + piece.length, -0.0),
+        }
+    }
+    values
 }
 
 impl Sum {
-    /// An empty sum of gradients of `model`; `None` where there is one rank, which needs none.
+    /// An empty sum of gradients of `model` in so many rounds; `None` where there is one rank, which needs none. Backward completes
+    /// gradients about in the `order` of these names.
     #[must_use]
-    pub fn new<M: Parameters + ?Sized>(ranks: &Communicator, model: &M) -> Option<Self> {
-        Self::in_buckets(ranks, model, BUCKET)
+    pub fn new<M: Parameters + ?Sized>(
+        ranks: &Communicator,
+        model: &M,
+        order: &[String],
+        rounds: usize,
+    ) -> Option<Self> {
+        Self::in_buckets(ranks, model, order, rounds, BUCKET)
     }
 
     fn in_buckets<M: Parameters + ?Sized>(
         ranks: &Communicator,
         model: &M,
+        order: &[String],
+        rounds: usize,
         most: usize,
     ) -> Option<Self> {
         let link = Arc::clone(ranks.link.as_ref()?);
-        let mut buckets: Vec<(Vec<(String, usize)>, usize)> = Vec::new();
         let mut lengths = BTreeMap::new();
         model.visit("", &mut |name, parameter| {
             if parameter.is_tracked() {
-                lengths.insert(name.to_owned(), parameter.flat().dims()[0]);
+                lengths.insert(name.to_owned(), parameter.len());
             }
         });
-        for (name, length) in lengths {
-            match buckets.last_mut() {
-                Some((names, values)) if *values + length <= most => {
-                    names.push((name, length));
-                    *values += length;
-                }
-                _ => buckets.push((vec![(name, length)], length)),
+        let mut buckets: Vec<Bucket> = Vec::new();
+        let mut places = BTreeMap::new();
+        let known = order.iter().filter_map(|name| lengths.remove_entry(name));
+        // What the order does not name comes last.
+        let known: Vec<(String, usize)> = known.collect();
+        for (name, length) in known.into_iter().chain(lengths) {
+            let full = |bucket: &Bucket| bucket.length + length > most;
+            if buckets.last().is_none_or(full) {
+                buckets.push(Bucket::default());
             }
+            let index = buckets.len() - 1;
+            let bucket = &mut buckets[index];
+            let place = Place {
+                bucket: index,
+                start: bucket.length,
+                length,
+                there: false,
+            };
+            bucket.length += length;
+            bucket.parameters += 1;
+            places.insert(name, place);
         }
-        let size = link.size();
-        let buckets = buckets.into_iter().map(|(parameters, values)| Bucket {
-            parameters,
-            part: values.div_ceil(size),
-        });
+        let lengths = buckets.iter().map(|bucket| bucket.length).collect();
+        let (sender, received) = channel();
+        let (end, ended) = channel();
+        let work = move || Worker::new(link, lengths, end).run(rounds, &received);
         Some(Self {
-            buckets: buckets.collect(),
-            link,
-            parts: None,
+            places,
+            buckets,
+            next: 0,
+            full: sender,
+            ended,
+            worker: Some(std::thread::spawn(work)),
         })
     }
 
-    /// Adds one gradient of every rank, in the order of ranks; `None` adds nothing.
+    /// This rank's gradient of one parameter is complete: the sum of what there is of it. Nothing at all adds nothing.
+    pub fn put(&mut self, name: &str, earlier: Option<&Tensor<1>>, last: Option<&Tensor<1>>) {
+        let Some(place) = self.places.get_mut(name).filter(|place| !place.there) else {
+            return;
+        };
+        place.there = true;
+        self.buckets[place.bucket].pieces.push(Piece {
+            start: place.start,
+            length: place.length,
+            earlier: earlier.cloned(),
+            last: last.cloned(),
+        });
+        // In one order on all ranks.
+        while let Some(bucket) = self.buckets.get_mut(self.next)
+            && bucket.pieces.len() == bucket.parameters
+        {
+            // Where the worker has ended, the end of the round says why.
+            let _ = self.full.send(std::mem::take(&mut bucket.pieces));
+            self.next += 1;
+        }
+    }
+
+    /// Ends a round: whatever was not put is taken from these gradients, and once this returns all ranks may talk of something else.
     ///
     /// # Errors
     /// When a rank is lost.
-    pub fn add(&mut self, gradients: Option<Gradients>) -> Result<(), RankError> {
-        let pending: Vec<Pending<Vec<f32>>> = self
-            .buckets
-            .iter()
-            .map(|bucket| {
-                let values = bucket.pack(gradients.as_ref(), self.link.size());
-                self.link.exchange(values)
-            })
-            .collect();
-        drop(gradients);
-        let mut sums = self.parts.take().unwrap_or_default().into_iter();
-        let mut parts = Vec::new();
-        for (bucket, pending) in self.buckets.iter().zip(pending) {
-            let received = pending.wait()?;
-            let mut received = received.chunks_exact(bucket.part.max(1));
-            let first = || received.next().map(<[f32]>::to_vec).unwrap_or_default();
-            let mut sum = sums.next().unwrap_or_else(first);
-            for more in received {
-                sum.iter_mut()
-                    .zip(more)
-                    .for_each(|(sum, more)| *sum += more);
-            }
-            parts.push(sum);
+    pub fn end_round(
+        &mut self,
+        earlier: Option<&Gradients>,
+        last: Option<&Gradients>,
+    ) -> Result<(), RankError> {
+        let names: Vec<String> = self.places.keys().cloned().collect();
+        for name in &names {
+            let of =
+                |gradients: Option<&Gradients>| gradients.and_then(|all| all.get(name)).cloned();
+            self.put(name, of(earlier).as_ref(), of(last).as_ref());
         }
-        self.parts = Some(parts);
-        Ok(())
+        self.next = 0;
+        for place in self.places.values_mut() {
+            place.there = false;
+        }
+        match self.ended.recv() {
+            Ok(()) => Ok(()),
+            // It ends before a round does only where a rank is lost.
+            Err(_) => Err(self.join().err().unwrap_or_else(gone)),
+        }
     }
 
     /// The sum, on every rank.
     ///
     /// # Errors
     /// When a rank is lost.
-    pub fn finish<M: Parameters + ?Sized>(self, model: &M) -> Result<Gradients, RankError> {
-        let parts = self.parts.unwrap_or_default().into_iter();
-        let pending: Vec<_> = parts.map(|part| self.link.collect(part)).collect();
-        let mut values = BTreeMap::new();
-        for (bucket, pending) in self.buckets.into_iter().zip(pending) {
-            let all = pending.wait()?;
-            let mut at = 0;
-            for (name, length) in bucket.parameters {
-                values.insert(name, all[at..at + length].to_vec());
-                at += length;
-            }
-        }
+    pub fn finish<M: Parameters + ?Sized>(mut self, model: &M) -> Result<Gradients, RankError> {
+        let all = self.join()?;
         let mut gradients = BTreeMap::new();
         model.visit("", &mut |name, parameter| {
-            if let Some(values) = values.remove(name) {
-                let length = values.len();
-                let device = parameter.untracked().device();
-                let tensor = Tensor::from_data(TensorData::new(values, [length]), &device);
+            if let Some(place) = self.places.get(name) {
+                let values = all[place.bucket][place.start..][..place.length].to_vec();
+                let data = TensorData::new(values, [place.length]);
+                let tensor = Tensor::from_data(data, &parameter.untracked().device());
                 gradients.insert(name.to_owned(), tensor);
             }
         });
         Ok(Gradients::from_map(gradients))
     }
+
+    /// What the worker leaves.
+    fn join(&mut self) -> Result<Vec<Vec<f32>>, RankError> {
+        match self.worker.take().map(JoinHandle::join) {
+            Some(Ok(sums)) => sums,
+            // What the tensor library panics with is said on this thread, as without a worker.
+            Some(Err(panic)) => std::panic::resume_unwind(panic),
+            None => Err(gone()),
+        }
+    }
 }
 
-impl Bucket {
-    /// The values of the bucket, padded to a part for each of `size` ranks.
-    fn pack(&self, gradients: Option<&Gradients>, size: usize) -> Vec<f32> {
-        // x + -0.0 is x, also where x is -0.0: what adds nothing leaves no trace.
-        let mut values = Vec::with_capacity(self.part * size);
-        for (name, length) in &self.parameters {
-            match gradients.and_then(|gradients| gradients.get(name)) {
-                Some(tensor) => values.extend(to_host(tensor.clone())),
-                None => values.resize(values.len() + length, -0.0),
+fn gone() -> RankError {
+    RankError {
+        rank: 0,
+        size: 0,
+        host: String::new(),
+        reason: "the thread that adds gradients has ended".to_owned(),
+    }
+}
+
+/// What adds up buckets beside backward.
+struct Worker {
+    link: Arc<dyn Link>,
+    /// Values of each bucket.
+    lengths: Vec<usize>,
+    /// This rank's parts of the sums so far.
+    parts: Vec<Vec<f32>>,
+    ended: Sender<()>,
+}
+
+impl Worker {
+    fn new(link: Arc<dyn Link>, lengths: Vec<usize>, ended: Sender<()>) -> Self {
+        Self {
+            link,
+            parts: vec![Vec::new(); lengths.len()],
+            lengths,
+            ended,
+        }
+    }
+
+    /// The sums of all buckets; nothing where this rank gives up before the last round.
+    fn run(
+        mut self,
+        rounds: usize,
+        buckets: &Receiver<Vec<Piece>>,
+    ) -> Result<Vec<Vec<f32>>, RankError> {
+        let size = self.link.size();
+        let mut collecting = Vec::new();
+        for round in 1..=rounds {
+            // One bucket travels while the one before it is added; in an order that is the same on all ranks, whoever is first.
+            let mut travelling = None;
+            for index in 0..=self.lengths.len() {
+                let next = match self.lengths.get(index) {
+                    None => None,
+                    Some(length) => {
+                        let Ok(pieces) = buckets.recv() else {
+                            return Ok(Vec::new());
+                        };
+                        let mut values = packed(pieces);
+                        values.resize(length.div_ceil(size) * size, -0.0);
+                        Some((index, self.link.exchange(values)))
+                    }
+                };
+                let before = std::mem::replace(&mut travelling, next);
+                let Some((index, pending)) = before else {
+                    continue;
+                };
+                self.add(index, &pending.wait()?);
+                if round == rounds {
+                    let part = std::mem::take(&mut self.parts[index]);
+                    collecting.push(self.link.collect(part));
+                }
+            }
+            if self.ended.send(()).is_err() {
+                return Ok(Vec::new());
             }
         }
-        values.resize(self.part * size, -0.0);
-        values
+        collecting.into_iter().map(super::Pending::wait).collect()
+    }
+
+    /// Adds what the ranks have for this one, in their order.
+    fn add(&mut self, index: usize, received: &[f32]) {
+        let part = self.lengths[index].div_ceil(self.link.size());
+        let mut received = received.chunks_exact(part.max(1));
+        let sum = &mut self.parts[index];
+        if sum.is_empty() {
+            sum.extend(received.next().unwrap_or_default());
+        }
+        for more in received {
+            let sum = sum.iter_mut().zip(more);
+            sum.for_each(|(sum, more)| *sum += more);
+        }
     }
 }
 
@@ -204,9 +373,10 @@ mod tests {
             for most in [4, 1000] {
                 let found = on_ranks(size, |ranks| {
                     let model = model();
-                    let mut sum = Sum::in_buckets(&ranks, &model, most).unwrap();
+                    let rounds = 12 / size;
+                    let mut sum = Sum::in_buckets(&ranks, &model, &[], rounds, most).unwrap();
                     for n in ranks.own(12) {
-                        sum.add(gradient(&model, n)).unwrap();
+                        sum.end_round(None, gradient(&model, n).as_ref()).unwrap();
                     }
                     bits(&sum.finish(&model).unwrap())
                 });
@@ -215,5 +385,72 @@ mod tests {
                 }
             }
         }
+    }
+
+    #[test]
+    fn neither_the_order_nor_the_time_of_what_is_put_changes_a_bit() {
+        let orders: [&[&str]; 3] = [&[], &["weight", "bias"], &["bias"]];
+        let sum = |order: &[&str], early: &[&str]| {
+            let order: Vec<String> = order.iter().map(ToString::to_string).collect();
+            let found = on_ranks(3, |ranks| {
+                let model = model();
+                let rank = ranks.rank();
+                let mut sum = Sum::in_buckets(&ranks, &model, &order, 1, 7).unwrap();
+                let (first, last) = (gradient(&model, 2 * rank), gradient(&model, 2 * rank + 4));
+                let of = |all: &Option<Gradients>, name| {
+                    all.as_ref().and_then(|all| all.get(name).cloned())
+                };
+                for name in early {
+                    sum.put(name, of(&first, name).as_ref(), of(&last, name).as_ref());
+                }
+                sum.end_round(first.as_ref(), last.as_ref()).unwrap();
+                bits(&sum.finish(&model).unwrap())
+            });
+            assert!(found.iter().all(|other| *other == found[0]));
+            found.into_iter().next().unwrap()
+        };
+        let expected = sum(&[], &[]);
+        for order in orders {
+            for early in orders {
+                assert_eq!(sum(order, early), expected, "{order:?} {early:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn buckets_are_added_while_others_are_not_there_yet() {
+        let found = on_ranks(2, |ranks| {
+            let model = model();
+            let order = ["bias", "weight"].map(str::to_owned);
+            let mut sum = Sum::in_buckets(&ranks, &model, &order, 1, 4).unwrap();
+            let gradient = gradient(&model, 0).unwrap();
+            sum.put("bias", None, gradient.get("bias"));
+            // Nothing but the first bucket was sent: it alone was exchanged.
+            let sent = sum.next;
+            sum.end_round(None, Some(&gradient)).unwrap();
+            (sent, sum.finish(&model).unwrap().iter().count())
+        });
+        assert_eq!(found, [(1, 2), (1, 2)]);
+    }
+
+    #[test]
+    fn a_rank_that_gives_up_in_a_round_is_named_by_the_others() {
+        let found = on_ranks(2, |ranks| {
+            let model = model();
+            let mut sum = Sum::in_buckets(&ranks, &model, &[], 1, 4).unwrap();
+            let gradient = gradient(&model, 0);
+            if ranks.rank() == 1 {
+                sum.put(
+                    "bias",
+                    None,
+                    gradient.as_ref().and_then(|all| all.get("bias")),
+                );
+                return String::new();
+            }
+            sum.end_round(None, gradient.as_ref())
+                .unwrap_err()
+                .to_string()
+        });
+        assert_eq!(found[0], "rank 1 of 2: it has left");
     }
 }
