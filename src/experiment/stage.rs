@@ -175,7 +175,8 @@ pub trait Op: Send + Sync + 'static {
         true
     }
 
-    /// Whether the processes of a job do it together: its `run` is called on every rank, and only that of rank 0 may write.
+    /// Whether the processes of a job do it together: its `run` is called on every rank with the same folders. Every file has one
+    /// writer, and what rank 0 returns and has written is the artifact.
     fn together(&self) -> bool {
         false
     }
@@ -207,6 +208,11 @@ pub trait Op: Send + Sync + 'static {
     /// milliseconds, no allocation of a model. `seed` is for such a simulation: the same for every stage, not the stage's own.
     fn plan(&self, _settings: &Self::Settings, _inputs: &Inputs<'_>, _seed: u64) -> StagePlan {
         StagePlan::default()
+    }
+
+    /// What a panic of the op with this text means, where it is no bug of it: a library that panics where a device's memory is full.
+    fn explain_panic(&self, _text: &str) -> Option<StageError> {
+        None
     }
 
     /// Does it. Writes files below `context.output()` and returns the `contents` of the artifact's `manifest.json`, which
@@ -253,6 +259,8 @@ pub trait AnyOp: Send + Sync + 'static {
     ) -> Option<Description>;
     /// [`Op::plan`]; empty where the settings do not fit.
     fn plan(&self, settings: &Value, inputs: &Inputs<'_>, seed: u64) -> StagePlan;
+    /// [`Op::explain_panic`].
+    fn explain_panic(&self, text: &str) -> Option<StageError>;
     /// [`Op::run`]; fails before any work where the settings do not fit.
     fn run(&self, settings: &Value, context: &mut dyn StageContext) -> Result<Value, StageError>;
 }
@@ -312,6 +320,9 @@ impl<O: Op> AnyOp for O {
             |_| StagePlan::default(),
             |s| Op::plan(self, &s, inputs, seed),
         )
+    }
+    fn explain_panic(&self, text: &str) -> Option<StageError> {
+        Op::explain_panic(self, text)
     }
     fn run(&self, settings: &Value, context: &mut dyn StageContext) -> Result<Value, StageError> {
         let settings = typed::<O>(settings).map_err(StageError::other)?;

@@ -1,5 +1,6 @@
 //! Where a stage computes.
 
+use crate::engine::compute::out_of_memory;
 use crate::engine::{Communicator, Compute, DeviceChoice, DeviceKind, Precision};
 use crate::experiment::{Code, StageContext, StageError};
 
@@ -29,4 +30,52 @@ pub(super) fn compute(
         context.log(&format!("computes on {}", compute.name()));
     }
     Ok(compute)
+}
+
+/// What a panic of the tensor library with this text says, where it says that a device's memory is full; `lower` is what to lower.
+pub(super) fn memory_is_full(text: &str, lower: &str) -> Option<StageError> {
+    let bytes = out_of_memory(text)?;
+    let asked = bytes.map_or_else(String::new, |bytes| {
+        format!(" for an array of {:.2} GB more", bytes as f64 / 1e9)
+    });
+    Some(StageError::Input {
+        code: Code::E0501,
+        message: format!("the device has no memory left{asked}"),
+        help: lower.to_owned(),
+    })
+}
+
+/// What to lower where a model only computes forward.
+pub(super) const SMALLER_FORWARD: &str =
+    "end what else runs on the device, take one with more memory, or `device: cpu`";
+
+/// What to lower where one is trained.
+pub(super) const SMALLER_MICRO_BATCH: &str =
+    "lower `micro_batch`: gradients are accumulated, and `batch` stays";
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// As the library says it, with what an `unwrap` writes before it and a backtrace behind.
+    #[test]
+    fn a_full_device_is_one_sentence_with_the_way_out_and_other_panics_stay_bugs() {
+        let full = "called `Result::unwrap()` on an `Err` value: out of device memory allocating 2500000000 bytes\n   0: cubecl";
+        match memory_is_full(full, "lower `micro_batch`") {
+            Some(StageError::Input {
+                code,
+                message,
+                help,
+            }) => {
+                assert_eq!(code, Code::E0501);
+                assert_eq!(
+                    message,
+                    "the device has no memory left for an array of 2.50 GB more"
+                );
+                assert_eq!(help, "lower `micro_batch`");
+            }
+            other => panic!("{other:?}"),
+        }
+        assert!(memory_is_full("index out of bounds: the len is 3", "").is_none());
+    }
 }

@@ -5,6 +5,7 @@
 
 mod run;
 
+use super::device::{SMALLER_FORWARD, memory_is_full};
 use super::predict::{artifact, takes_pixels};
 use crate::decoding::DecodingSettings;
 use crate::engine::{DeviceChoice, Precision};
@@ -242,6 +243,10 @@ impl Op for Reconstruct {
 
     fn plan(&self, _settings: &ReconstructSettings, _inputs: &Inputs<'_>, _seed: u64) -> StagePlan {
         StagePlan::default()
+    }
+
+    fn explain_panic(&self, text: &str) -> Option<StageError> {
+        memory_is_full(text, SMALLER_FORWARD)
     }
 
     fn run(

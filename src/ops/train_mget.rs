@@ -6,6 +6,7 @@
 
 mod run;
 
+use super::device::memory_is_full;
 use crate::engine::{DeviceChoice, Precision};
 use crate::experiment::{
     Arity, ArtifactKind, Code, Description, Entry, Inputs, Op, OpEntry, Port, Problem,
@@ -292,6 +293,11 @@ impl Op for TrainMget {
                 ),
             ],
         }
+    }
+
+    fn explain_panic(&self, text: &str) -> Option<StageError> {
+        let lower = "lower `micro_batch` (gradients are accumulated, and `batch` stays), set `activation_checkpointing: true`, or take fewer `input_tokens` and `target_tokens`";
+        memory_is_full(text, lower)
     }
 
     fn run(

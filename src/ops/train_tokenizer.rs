@@ -344,6 +344,10 @@ impl Op for TrainTokenizer {
         }
     }
 
+    fn explain_panic(&self, text: &str) -> Option<StageError> {
+        super::device::memory_is_full(text, super::device::SMALLER_MICRO_BATCH)
+    }
+
     fn run(
         &self,
         settings: &TrainTokenizerSettings,

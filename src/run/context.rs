@@ -6,7 +6,7 @@ use super::interrupt::Interrupt;
 use super::metrics::Metrics;
 use super::progress::Task;
 use super::tensorboard::SessionStatus;
-use crate::experiment::{InputArtifact, StageContext, StageError};
+use crate::experiment::{AnyOp, InputArtifact, StageContext, StageError};
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::fs::File;
@@ -200,7 +200,27 @@ fn chain(error: &(dyn std::error::Error + 'static)) -> String {
     text
 }
 
-pub fn panic_text(panic: &(dyn std::any::Any + Send)) -> String {
+/// What becomes of a panic: where the op cannot explain it, it is a bug of the op.
+pub fn explain_panic(
+    stage: &str,
+    op: &dyn AnyOp,
+    panic: &(dyn std::any::Any + Send),
+    help: &str,
+) -> RunError {
+    let text = panic_text(panic);
+    match op.explain_panic(&text) {
+        Some(error) => explain(stage, error),
+        None => RunError::Stage {
+            stage: stage.into(),
+            code: "E0806".into(),
+            message: format!("a bug in op `{}`: {text}", op.name()),
+            help: help.into(),
+            exit: 2,
+        },
+    }
+}
+
+fn panic_text(panic: &(dyn std::any::Any + Send)) -> String {
     let text = panic.downcast_ref::<&str>().map(|text| (*text).to_owned());
     let text = text.or_else(|| panic.downcast_ref::<String>().cloned());
     text.unwrap_or_else(|| "it panicked without a message".into())

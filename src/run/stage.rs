@@ -4,7 +4,7 @@ pub mod peers;
 
 use self::peers::{Part, Peers};
 use super::cache::{Cache, Entry, Key, Made, Recipe};
-use super::context::{Context, explain, panic_text};
+use super::context::{Context, explain, explain_panic};
 use super::environment;
 use super::error::{Failure, RunError};
 use super::files;
@@ -249,14 +249,12 @@ fn perform(
     let result = catch_unwind(AssertUnwindSafe(|| op.run(&work.settings, &mut context)));
     let result = match result {
         Ok(result) => result.map_err(|error| explain(&work.stage, error)),
-        Err(panic) => Err(RunError::Stage {
-            stage: work.stage.clone(),
-            code: "E0806".into(),
-            message: format!("a bug in op `{}`: {}", work.op, panic_text(panic.as_ref())),
-            help: "please report it with the run's directory; everything finished before it stays"
-                .into(),
-            exit: 2,
-        }),
+        Err(panic) => Err(explain_panic(
+            &work.stage,
+            op,
+            panic.as_ref(),
+            "please report it with the run's directory; everything finished before it stays",
+        )),
     };
     let ended = peers.map_or(Ok(()), |peers| {
         peers.end(result.as_ref().map(drop).map_err(ToString::to_string))

@@ -2,12 +2,12 @@
 //!
 //! One process, rank 0, has the run: its directory, the cache, the progress, the record. Before a stage whose op is
 //! [`together`](crate::experiment::Op::together) it hands the others what they need for it; they run the same op in a context
-//! that keeps nothing, and write nothing. Every other stage is rank 0's alone.
+//! that records nothing. What they write are pieces that are theirs alone: shards, clips. Every other stage is rank 0's.
 
 use super::inputs;
 use crate::experiment::{InputArtifact, StageContext, StageError};
 use crate::run::cache::Cache;
-use crate::run::context::{explain, panic_text};
+use crate::run::context::{explain, explain_panic};
 use crate::run::error::RunError;
 use crate::run::schedule::Task;
 use serde::{Deserialize, Serialize};
@@ -66,17 +66,7 @@ impl Part {
             Ok(result) => result
                 .map(drop)
                 .map_err(|error| explain(&self.task.stage, error)),
-            Err(panic) => Err(RunError::Stage {
-                stage: self.task.stage.clone(),
-                code: "E0806".into(),
-                message: format!(
-                    "a bug in op `{}`: {}",
-                    self.task.op,
-                    panic_text(panic.as_ref())
-                ),
-                help: String::new(),
-                exit: 2,
-            }),
+            Err(panic) => Err(explain_panic(&self.task.stage, op, panic.as_ref(), "")),
         }
     }
 }

@@ -296,6 +296,28 @@ impl Compute {
     }
 }
 
+/// Whether a panic of the tensor library with this text says that a device's memory is full, and how many bytes were asked for, where it
+/// says that: the library hands such errors on as panics alone.
+#[must_use]
+pub fn out_of_memory(text: &str) -> Option<Option<u64>> {
+    // As `cubecl` 0.11 writes its errors.
+    let asked = [
+        "out of device memory allocating ",
+        "can't allocate buffer of size: ",
+        "Can't allocate ",
+    ];
+    let number = |text: &str| {
+        let digits = text.split(|c: char| !c.is_ascii_digit()).next()?;
+        digits.parse().ok()
+    };
+    let found = asked.iter().find_map(|start| text.split_once(start));
+    let full = text.contains("out-of-memory error happened");
+    match found {
+        Some((_, rest)) => Some(number(rest)),
+        None => full.then_some(None),
+    }
+}
+
 /// A GPU in hardware, the fastest way to it first. A program that plays one is never chosen for anybody.
 fn first_gpu() -> Option<Compute> {
     use DeviceKind::{Cuda, Metal, Vulkan, Wgpu};
@@ -392,6 +414,28 @@ mod tests {
                 "{message}"
             );
         }
+    }
+
+    #[test]
+    fn a_full_memory_is_known_by_the_words_of_the_library() {
+        for (text, bytes) in [
+            (
+                "Err value: out of device memory allocating 1024 bytes\n0: x",
+                Some(1024),
+            ),
+            ("can't allocate buffer of size: 77\n", Some(77)),
+            (
+                "Can't allocate 5 bytes: every page size the memory tracks still holds live allocations",
+                Some(5),
+            ),
+            (
+                "An out-of-memory error happened during launch\nCaused by:\n  x",
+                None,
+            ),
+        ] {
+            assert_eq!(out_of_memory(text), Some(bytes), "{text}");
+        }
+        assert_eq!(out_of_memory("a loss of memory"), None);
     }
 
     #[test]
