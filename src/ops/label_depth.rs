@@ -1,16 +1,18 @@
 //! `op: label_depth`: clips without depth get pseudo labels from a depth network (Sec. 3.1).
 //!
 //! The frames of a clip are a video of their own. Measured depth is kept unless it is to be replaced. What the labels are of
-//! (the network's kind, size and hash) stands in the artifact, and the clips' coding of depth follows the kind.
+//! (the network's kind, size and hash) stands in the artifact, and the clips' coding of depth follows the kind. Several ranks label a
+//! shard each at a time.
 
 use super::clip_signals::{SPLITS, damaged, described_format, format};
 use super::clips::shape_of;
-use super::device::compute;
+use super::device::{compute, memory_is_full};
+use super::together::{in_rounds, unseen};
 use crate::clip::depth_video::{DepthCoding, DepthKind, DepthRange};
 use crate::datasets::ClipSource;
-use crate::datasets::convert::{ConvertSettings, Share, convert};
+use crate::datasets::convert::{ConvertSettings, Share, convert, whole};
 use crate::datasets::shards::{ShardClips, TarSink};
-use crate::engine::{DeviceChoice, Precision};
+use crate::engine::{Communicator, DeviceChoice, Precision};
 use crate::experiment::{
     Arity, ArtifactKind, Code, Description, FileInput, FilePath, Inputs, Op, OpEntry, Port,
     Problem, SignalFacts, StageContext, StageError, StagePlan,
@@ -101,6 +103,10 @@ impl Op for LabelDepth {
         false
     }
 
+    fn together(&self) -> bool {
+        true
+    }
+
     fn files(&self, settings: &LabelDepthSettings) -> Vec<FileInput> {
         let path: &Path = settings.network.as_ref();
         // A folder that is not there is refused by `check`, once.
@@ -183,6 +189,11 @@ impl Op for LabelDepth {
         }
     }
 
+    fn explain_panic(&self, text: &str) -> Option<StageError> {
+        let lower = "lower `input_size`, end what else runs on the device, or take `device: cpu`";
+        memory_is_full(text, lower)
+    }
+
     fn run(
         &self,
         settings: &LabelDepthSettings,
@@ -219,8 +230,13 @@ impl Op for LabelDepth {
             }
         }
         let total: u64 = sources.iter().map(|(_, source)| source.len() as u64).sum();
-        let mut done = 0;
-        let mut splits = serde_json::Map::new();
+        let how = ConvertSettings {
+            clips_per_shard: 32,
+            skip_damaged: false,
+        };
+        let ranks = Communicator::world();
+        let mut labelled = Vec::new();
+        let mut pieces = Vec::new();
         for (split, source) in sources {
             let source = LabelledClips::new(
                 source,
@@ -232,12 +248,19 @@ impl Op for LabelDepth {
             let shards = context.checkpoints().join(SHARDS).join(split);
             let markers = context.checkpoints().join(MARKERS).join(split);
             let sink = TarSink::new(&shards, &markers).map_err(|error| refused(&error))?;
-            let how = ConvertSettings {
-                clips_per_shard: 32,
-                skip_damaged: false,
-            };
-            let converted = convert(&source, &sink, &how, Share::WHOLE, &mut |progress| {
-                context.progress(done + progress.done as u64, total, "clips");
+            let count = source.len().div_ceil(how.clips_per_shard);
+            pieces.extend((0..count).map(|shard| (labelled.len(), Share::new(shard, count))));
+            labelled.push((split, source, sink, count));
+        }
+        let mut done = 0;
+        in_rounds(&ranks, pieces.len(), context, |index, context| {
+            let (place, share) = pieces[index];
+            let (_, source, sink, _) = &labelled[place];
+            let mut own = 0;
+            let converted = convert(source, sink, &how, share, &mut |progress| {
+                own = progress.done as u64;
+                let others = ranks.size() as u64;
+                context.progress((done + own * others).min(total), total, "clips");
                 if context.interrupted() {
                     return ControlFlow::Break(());
                 }
@@ -247,10 +270,20 @@ impl Op for LabelDepth {
             if converted.interrupted {
                 return Err(StageError::Interrupted);
             }
-            done += source.len() as u64;
+            // About: the others are as far.
+            done += own * ranks.size() as u64;
+            Ok(())
+        })?;
+        if !ranks.is_root() {
+            return Ok(Value::Null);
+        }
+        let mut splits = serde_json::Map::new();
+        for (split, source, sink, shards) in &labelled {
+            let tally = whole(source.len(), sink, &how)
+                .ok_or_else(|| unseen(&context.checkpoints().join(MARKERS).join(split)))?;
             splits.insert(
-                split.to_owned(),
-                json!({ "clips": converted.tally.clips, "shards": converted.shards }),
+                (*split).to_owned(),
+                json!({ "clips": tally.clips, "shards": shards }),
             );
         }
         for split in splits.keys() {

@@ -12,6 +12,7 @@ mod predict;
 mod reconstruct;
 mod statistics;
 mod table;
+mod together;
 pub mod tokenize;
 pub mod tokenizer_entry;
 pub mod train_mget;

@@ -1,13 +1,15 @@
 //! `op: predict`: a model generates what it was not inputs, for every clip of a split (Supp. C).
 //!
 //! Writes a folder of [`crate::reconstruction::predictions`]: decoded signals with a confidence per sample, and beside it the
-//! tokenizer floor: the clips' own signals after a round trip through the model's tokenizers.
+//! tokenizer floor: the clips' own signals after a round trip through the model's tokenizers. Several ranks predict a batch each at a
+//! time.
 
-use super::device::compute;
+use super::device::{SMALLER_FORWARD, compute, memory_is_full};
+use super::together::in_rounds;
 use crate::clip::Clip;
 use crate::clip::store::ClipSet;
 use crate::decoding::DecodingSettings;
-use crate::engine::{DeviceChoice, Precision};
+use crate::engine::{Communicator, DeviceChoice, Precision};
 use crate::evaluation::runtime::runtime;
 use crate::experiment::{
     Arity, ArtifactKind, Code, Description, Entry, InputArtifact, Inputs, Op, OpEntry, Port,
@@ -17,7 +19,7 @@ use crate::masking::PIXELS;
 use crate::mget::MgetSpec;
 use crate::model::{GenerationRequest, Model, ModelError};
 use crate::reconstruction::predictions::{
-    FLOOR, PredictionsWriter, ScaleStatus, SignalNote, sample_folder,
+    FLOOR, PredictedClip, PredictionsWriter, ScaleStatus, SignalNote, sample_folder,
 };
 use crate::run::environment::Stopwatch;
 use schemars::JsonSchema;
@@ -29,6 +31,9 @@ use std::path::Path;
 
 /// Clips that go through the model at once.
 const BATCH: usize = 8;
+
+/// By modality, one value per sample.
+type Confidence = BTreeMap<String, Vec<f32>>;
 
 /// Settings of [`Predict`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -114,6 +119,10 @@ impl Op for Predict {
 
     fn version(&self) -> u32 {
         4
+    }
+
+    fn together(&self) -> bool {
+        true
     }
 
     fn about(&self) -> &'static str {
@@ -229,6 +238,10 @@ impl Op for Predict {
         }
     }
 
+    fn explain_panic(&self, text: &str) -> Option<StageError> {
+        memory_is_full(text, SMALLER_FORWARD)
+    }
+
     fn run(
         &self,
         settings: &PredictSettings,
@@ -252,38 +265,39 @@ impl Op for Predict {
         let create = |folder: &Path, system: &str| {
             PredictionsWriter::create(folder, system, notes.clone()).map_err(StageError::other)
         };
-        let mut writer = create(context.output(), "reviv")?;
-        let mut floor = None;
+        // The predictions themselves, the floor, and the samples; folders of one form.
+        let mut writers = vec![create(context.output(), "reviv")?];
         if settings.reconstruction_bound {
-            floor = Some(create(&context.output().join(FLOOR), "tokenizer floor")?);
+            let folder = context.output().join(FLOOR);
+            writers.push(create(&folder, "tokenizer floor")?);
         }
         let samples = if settings.samples > 1 {
             settings.samples
         } else {
             0
         };
-        let mut sampled = (0..samples)
-            .map(|n| create(&sample_folder(context.output(), n), "sample"))
-            .collect::<Result<Vec<_>, _>>()?;
+        let first_sample = writers.len();
+        for n in 0..samples {
+            writers.push(create(&sample_folder(context.output(), n), "sample")?);
+        }
         let mut read: Vec<&str> = settings.inputs.iter().map(|name| signal_of(name)).collect();
         if settings.reconstruction_bound {
             read.extend(targets.iter().map(String::as_str));
         }
         let mut times = Times::default();
-        let mut done = 0;
-        while done < total {
-            if context.interrupted() {
-                return Err(StageError::Interrupted);
-            }
-            let count = BATCH.min(total - done);
+        let ranks = Communicator::world();
+        // By batch, of those that are this rank's: what the index of every writer says of its clips.
+        let mut made: Vec<Vec<Vec<PredictedClip>>> = Vec::new();
+        in_rounds(&ranks, total.div_ceil(BATCH), context, |index, context| {
+            let range = index * BATCH..((index + 1) * BATCH).min(total);
+            let count = range.len();
             let batch = times
                 .take("read", count, || {
-                    let range = done..done + count;
-                    let clips = range.map(|index| clips.clip_with(index, &read));
+                    let clips = range.clone().map(|index| clips.clip_with(index, &read));
                     clips.collect::<Result<Vec<Clip>, _>>()
                 })
                 .map_err(StageError::other)?;
-            let ids: Vec<u64> = (done..done + count).map(|i| i as u64).collect();
+            let ids: Vec<u64> = range.clone().map(|i| i as u64).collect();
             let conditioning = times
                 .take("encode", count, || {
                     model.encode_inputs(&batch, request.inputs)
@@ -294,45 +308,56 @@ impl Op for Predict {
                     model.generate_rounds(&conditioning, &ids, &request, samples)
                 })
                 .map_err(refused)?;
-            let made = times
+            let decoded = times
                 .take("detokenize", count, || {
                     model.decode(&batch, &tokens, &request)
                 })
                 .map_err(refused)?;
-            for one in made {
-                writer
-                    .add(&one.clip, &one.confidence)
-                    .map_err(StageError::other)?;
+            let mut entries = vec![Vec::new(); writers.len()];
+            let mut write = |writer: usize, at: usize, clip: &Clip, confidence: &Confidence| {
+                let entry = writers[writer].write(range.start + at, clip, confidence);
+                entries[writer].push(entry.map_err(StageError::other)?);
+                Ok::<_, StageError>(())
+            };
+            for (at, one) in decoded.iter().enumerate() {
+                write(0, at, &one.clip, &one.confidence)?;
             }
             let others = model
                 .decode_samples(&batch, &tokens, &request, samples)
                 .map_err(refused)?;
-            for (writer, made) in sampled.iter_mut().zip(others) {
-                for one in made {
-                    writer
-                        .add(&one.clip, &one.confidence)
-                        .map_err(StageError::other)?;
+            for (n, decoded) in others.iter().enumerate() {
+                for (at, one) in decoded.iter().enumerate() {
+                    write(first_sample + n, at, &one.clip, &one.confidence)?;
                 }
             }
-            if let Some(floor) = &mut floor {
+            if settings.reconstruction_bound {
                 let back = model.round_trip(&batch, &targets).map_err(refused)?;
-                for clip in back {
-                    floor
-                        .add(&clip, &BTreeMap::new())
-                        .map_err(StageError::other)?;
+                for (at, clip) in back.iter().enumerate() {
+                    write(1, at, clip, &Confidence::new())?;
                 }
             }
-            done += count;
+            made.push(entries);
+            let done = ((index + ranks.size()) * BATCH).min(total);
             context.progress(done as u64, total as u64, "clips");
+            Ok(())
+        })?;
+        let mut made = made.into_iter();
+        let all = ranks.map(total.div_ceil(BATCH), |_| {
+            made.next()
+                .ok_or_else(|| ranks.odd(ranks.rank(), &"a batch is missing"))
+        });
+        if !ranks.is_root() {
+            return all.map(|_| Value::Null).map_err(StageError::other);
         }
-        writer.finish().map_err(StageError::other)?;
-        for writer in sampled {
+        for entries in all.map_err(StageError::other)? {
+            for (writer, entries) in writers.iter_mut().zip(entries) {
+                writer.list(entries);
+            }
+        }
+        for writer in writers {
             writer.finish().map_err(StageError::other)?;
         }
-        if let Some(floor) = floor {
-            floor.finish().map_err(StageError::other)?;
-        }
-        times.record(context, done, &compute.name())?;
+        times.record(context, total, &compute.name())?;
         Ok(json!({
             "split": settings.split,
             "clips": total,

@@ -3,14 +3,15 @@
 //! Writes `<split>/<modality>/shard-000000.tar` as [`crate::training::shards`] reads them, `<split>/pixels/` with raw colour
 //! video where it is asked for, and every tokenizer in `tokenizers/<modality>/`, so that what is trained on the tokens can be
 //! used on its own. A clip without a modality, or with all of it invalid, has no member in that modality's shards. A shard
-//! that is complete survives an interruption.
+//! that is complete survives an interruption. Several ranks make a shard each at a time.
 
 use super::clip_signals::{SPLITS, damaged, format, modality, open_split};
-use super::device::compute;
+use super::device::{SMALLER_FORWARD, compute, memory_is_full};
+use super::together::{in_rounds, unseen};
 use crate::clip::shard::{ShardWriter, TOKENS_PER_SHARD};
 use crate::clip::store::ClipSet;
 use crate::datasets::shards::tars;
-use crate::engine::{DeviceChoice, Precision};
+use crate::engine::{Communicator, DeviceChoice, Precision};
 use crate::experiment::{
     Arity, ArtifactKind, Code, Description, Inputs, Op, OpEntry, Port, Problem, StageContext,
     StageError, StagePlan, TokenFacts, TokenPlan,
@@ -110,6 +111,10 @@ impl Op for Tokenize {
 
     fn seeded(&self) -> bool {
         false
+    }
+
+    fn together(&self) -> bool {
+        true
     }
 
     fn data(&self, settings: &TokenizeSettings) -> Vec<(String, String)> {
@@ -226,6 +231,10 @@ impl Op for Tokenize {
         }
     }
 
+    fn explain_panic(&self, text: &str) -> Option<StageError> {
+        memory_is_full(text, SMALLER_FORWARD)
+    }
+
     fn run(
         &self,
         settings: &TokenizeSettings,
@@ -239,6 +248,7 @@ impl Op for Tokenize {
             .ok_or_else(|| damaged("no clips arrived"))?;
         let format = format(&clips)?;
         let compute = compute(settings.device, Precision::F32, context)?;
+        let ranks = Communicator::world();
         let mut writers = Vec::new();
         let mut tokens = BTreeMap::new();
         for artifact in context.inputs("tokenizers").to_vec() {
@@ -255,8 +265,10 @@ impl Op for Tokenize {
                 vocabulary: tokenizer.vocabulary() as u64,
             };
             tokens.insert(name.clone(), facts);
-            let place = context.output().join("tokenizers").join(name);
-            deliver(&artifact.path, &place, false)?;
+            if ranks.is_root() {
+                let place = context.output().join("tokenizers").join(name);
+                deliver(&artifact.path, &place, false)?;
+            }
             writers.push(ModalityTokens {
                 modality,
                 tokenizer,
@@ -280,39 +292,57 @@ impl Op for Tokenize {
             contents[PIXELS] = json!([format.frames, format.size, format.size, 3]);
         }
         if let Some(name) = &settings.made {
-            let root = context.data_root(name).map(Path::to_owned);
-            let root = root.ok_or_else(|| damaged(&format!("`{name}` is not in `data.yaml`")))?;
-            take_made(&root, &format, &writers, pixels, &sets, context.output())?;
+            if ranks.is_root() {
+                let root = context.data_root(name).map(Path::to_owned);
+                let root =
+                    root.ok_or_else(|| damaged(&format!("`{name}` is not in `data.yaml`")))?;
+                take_made(&root, &format, &writers, pixels, &sets, context.output())?;
+            }
             return Ok(contents);
         }
         let total: usize = sets.iter().map(|(_, set)| set.len()).sum();
         let markers = context.checkpoints().join(MARKERS);
         std::fs::create_dir_all(&markers).map_err(StageError::io(&markers))?;
-        let mut done = 0;
+        let mut shards = Vec::new();
         for (split, set) in &sets {
             let folder = context.checkpoints().join(SHARDS).join(split);
             std::fs::create_dir_all(&folder).map_err(StageError::io(&folder))?;
-            for start in (0..set.len()).step_by(TOKENS_PER_SHARD) {
+            for (number, start) in (0..set.len()).step_by(TOKENS_PER_SHARD).enumerate() {
                 let end = (start + TOKENS_PER_SHARD).min(set.len());
-                let number = (start / TOKENS_PER_SHARD) as u32;
                 let marker = markers.join(format!("{split}-{number:06}"));
-                if !marker.exists() {
-                    let shard = ShardWriter::new(&folder, number);
-                    let mut watch = |clips: usize| {
-                        context.progress((done + clips) as u64, total as u64, "clips");
-                        let stop = context.interrupted();
-                        Ok::<_, TrainingError>(if stop { Flow::Stop } else { Flow::Continue })
-                    };
-                    if !write_shard(&writers, pixels, set, start..end, shard, &mut watch)
-                        .map_err(unusable)?
-                    {
-                        return Err(StageError::Interrupted);
-                    }
-                    std::fs::write(&marker, b"").map_err(StageError::io(&marker))?;
-                }
-                done += end - start;
-                context.progress(done as u64, total as u64, "clips");
+                shards.push((set, start..end, number as u32, folder.clone(), marker));
             }
+        }
+        let before = |index: usize| -> usize {
+            let done = shards.iter().take(index);
+            done.map(|(_, range, ..)| range.len()).sum()
+        };
+        in_rounds(&ranks, shards.len(), context, |index, context| {
+            let (set, range, number, folder, marker) = &shards[index];
+            let done = before(index);
+            if !marker.exists() {
+                let shard = ShardWriter::new(folder, *number);
+                let mut watch = |clips: usize| {
+                    context.progress((done + clips) as u64, total as u64, "clips");
+                    let stop = context.interrupted();
+                    Ok::<_, TrainingError>(if stop { Flow::Stop } else { Flow::Continue })
+                };
+                if !write_shard(&writers, pixels, *set, range.clone(), shard, &mut watch)
+                    .map_err(unusable)?
+                {
+                    return Err(StageError::Interrupted);
+                }
+                std::fs::write(marker, b"").map_err(StageError::io(marker))?;
+            }
+            let round = index + ranks.size();
+            context.progress(before(round) as u64, total as u64, "clips");
+            Ok(())
+        })?;
+        if !ranks.is_root() {
+            return Ok(contents);
+        }
+        if let Some((.., marker)) = shards.iter().find(|(.., marker)| !marker.exists()) {
+            return Err(unseen(marker));
         }
         let names: Vec<&str> = sets.iter().map(|(split, _)| *split).collect();
         deliver_splits(context.checkpoints(), &names, context.output())?;

@@ -181,7 +181,24 @@ impl PredictionsWriter {
         clip: &Clip,
         confidence: &BTreeMap<String, Vec<f32>>,
     ) -> Result<(), PredictionsError> {
-        let file = format!("clips/{:06}.npz", self.index.clips.len());
+        let next = self.index.clips.len();
+        let entry = self.write(next, clip, confidence)?;
+        self.index.clips.push(entry);
+        Ok(())
+    }
+
+    /// Writes one clip's predicted signals as those of clip `number` of all, and gives its entry of the index: for several who write
+    /// clips of one folder. [`PredictionsWriter::list`] takes the entries.
+    ///
+    /// # Errors
+    /// When the file cannot be written.
+    pub fn write(
+        &self,
+        number: usize,
+        clip: &Clip,
+        confidence: &BTreeMap<String, Vec<f32>>,
+    ) -> Result<PredictedClip, PredictionsError> {
+        let file = format!("clips/{number:06}.npz");
         let mut npz = to_npz(clip);
         for (modality, values) in confidence {
             npz = npz.with(
@@ -190,12 +207,16 @@ impl PredictionsWriter {
             );
         }
         npz.write(&self.directory.join(&file))?;
-        self.index.clips.push(PredictedClip {
+        Ok(PredictedClip {
             id: clip.id.clone(),
             source: clip.source.clone(),
             file,
-        });
-        Ok(())
+        })
+    }
+
+    /// Lists clips that were written by themselves, in their order.
+    pub fn list(&mut self, clips: impl IntoIterator<Item = PredictedClip>) {
+        self.index.clips.extend(clips);
     }
 
     /// Writes the index.

@@ -25,6 +25,7 @@ mod pickles;
 mod ranks;
 #[cfg(feature = "mpi")]
 mod ranks_mpi;
+mod ranks_ops;
 mod readers_bad;
 mod reconstruct_command;
 mod reconstruction;

@@ -21,7 +21,9 @@ stages:
   tokens: {op: tokenize, clips: clips, tokenizers: [tok_camera, tok_gaze]}
   mget:
     {op: train_mget, tokens: [tokens], size: laptop_small, masking: {use: dirichlet_mixture, input_tokens: 16, target_tokens: 16},
-     steps: 8, warmup: {steps: 2}, batch: 12, micro_batch: 1, reduction: ordered, validate_every: 4, checkpoint_every: 2}
+     steps: 8, warmup: {steps: 2}, batch: 12, micro_batch: 1, reduction: ordered, validate_every: 4, checkpoint_every: 2,
+     optimizer: {shard: true}}
+  predictions: {op: predict, model: mget, clips: clips, inputs: [camera], split: train}
 ";
 
 fn mpirun(ranks: usize, folder: &Path, runs: &str) -> Command {
@@ -163,7 +165,7 @@ fn a_rank_killed_at_a_random_step_ends_the_job_and_another_number_of_ranks_conti
     let kills = std::env::var("REVIV_TEST_KILLS")
         .ok()
         .and_then(|n| n.parse().ok())
-        .unwrap_or(3);
+        .unwrap_or(10);
     for attempt in 0..kills {
         let mut random = reviv::random::stream(seed, "test.ranks", attempt, 0);
         let (ranks, step) = (random.random_range(2..=4), random.random_range(1..7));

@@ -44,6 +44,18 @@ impl Share {
     /// Everything.
     pub const WHOLE: Share = Share { index: 0, of: 1 };
 
+    /// Part `index`, from 0, of `of`; everything where there are none.
+    #[must_use]
+    pub fn new(index: usize, of: usize) -> Self {
+        match of {
+            0 => Self::WHOLE,
+            _ => Share {
+                index: index % of,
+                of,
+            },
+        }
+    }
+
     /// Whether a shard belongs to this part.
     #[must_use]
     pub fn has(self, shard: usize) -> bool {
