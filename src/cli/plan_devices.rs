@@ -57,9 +57,10 @@ impl Devices {
         }
         let mut text = String::new();
         for stage in stages {
-            let Some((training, checkpoint_every)) = training(experiment, stage) else {
+            let Some(planned) = planned(experiment, stage, f64::from(devices)) else {
                 continue;
             };
+            let training = planned.training;
             let rate = self.rate.unwrap_or_else(|| training.rate_of_the_paper());
             let mut link = self.interconnect;
             link.bytes_per_second = self.bandwidth.unwrap_or(link.bytes_per_second);
@@ -67,9 +68,10 @@ impl Devices {
                 devices: f64::from(devices),
                 rate,
                 interconnect: link,
-                overlap: 0.0,
+                overlap: planned.overlap,
+                exchanges: planned.exchanges,
                 disk: DISK,
-                checkpoint_every,
+                checkpoint_every: planned.checkpoint_every,
                 failures_per_day: FAILURES,
                 restart: RESTART,
             });
@@ -95,26 +97,54 @@ impl Devices {
     }
 }
 
-/// What the plan says of a training, and how often it writes a checkpoint.
-fn training(experiment: &Experiment, stage: &PlannedStage) -> Option<(Training, f64)> {
+/// Backward's share of computing.
+const BACKWARD: f64 = 2.0 / 3.0;
+
+/// What the plan and the settings say of a training on so many devices.
+struct Planned {
+    training: Training,
+    /// Steps.
+    checkpoint_every: f64,
+    overlap: f64,
+    exchanges: f64,
+}
+
+fn planned(experiment: &Experiment, stage: &PlannedStage, devices: f64) -> Option<Planned> {
     let plan = &stage.plan;
     let (steps, _) = plan.work.as_ref()?;
-    let training = Training {
-        parameters: plan.parameters? as f64,
-        steps: *steps as f64,
-        flop: plan.flop?,
-        tokens: plan.tokens_per_step?,
-    };
     let cell = experiment.cells.get(*stage.cells.first()?)?;
     let own = cell
         .graph
         .stages
         .iter()
         .find(|own| own.name == stage.name)?;
-    let every = own.settings["checkpoint_every"].as_f64();
+    let settings = &own.settings;
+    let training = Training {
+        parameters: plan.parameters? as f64,
+        steps: *steps as f64,
+        flop: plan.flop?,
+        tokens: plan.tokens_per_step?,
+        sharded: settings["optimizer"]["shard"] == true && devices > 1.0,
+    };
+    let every = settings["checkpoint_every"].as_f64();
     // Where there are none, a failure loses everything: the interval is the training.
     let every = every.filter(|every| *every > 0.0);
-    Some((training, every.unwrap_or(training.steps)))
+    let size = settings["micro_batch"].as_f64().filter(|size| *size > 0.0);
+    let batch = settings["batch"].as_f64().unwrap_or(1.0);
+    // Of one device; by default it has one.
+    let micro_batches = size.map_or(1.0, |size| ((batch / size).ceil() / devices).max(1.0));
+    let ordered = settings["reduction"] == "ordered";
+    let (exchanges, overlap) = if ordered {
+        (micro_batches, BACKWARD)
+    } else {
+        (1.0, BACKWARD / micro_batches)
+    };
+    Some(Planned {
+        checkpoint_every: every.unwrap_or(training.steps),
+        training,
+        overlap,
+        exchanges,
+    })
 }
 
 fn lines(text: &mut String, training: &Training, cost: &Cost) {
@@ -122,7 +152,7 @@ fn lines(text: &mut String, training: &Training, cost: &Cost) {
     let giga = |bytes: f64| bytes / 1e9;
     let lines = [
         format!(
-            "a step of {:.3} s: computing {:.3} s, reduction {:.3} s ({:.2} GB sent per device, none of it hidden); efficiency {:.0}%",
+            "a step of {:.3} s: computing {:.3} s, exchanges that backward does not hide {:.3} s ({:.2} GB sent per device); efficiency {:.0}%",
             step,
             cost.compute,
             cost.exposed,
@@ -136,11 +166,19 @@ fn lines(text: &mut String, training: &Training, cost: &Cost) {
             cost.days,
             training.tokens * training.steps / 1e9
         ),
-        format!(
-            "{:.2} GB of weights, gradients and moments per device; {:.2} GB were the moments sharded (ZeRO-1, which is not there yet); activations besides",
-            giga(cost.state),
-            giga(cost.sharded_state)
-        ),
+        if training.sharded {
+            format!(
+                "{:.2} GB of weights, gradients and a share of the moments per device; {:.2} GB without `optimizer: {{shard: true}}`; activations besides",
+                giga(cost.sharded_state),
+                giga(cost.whole_state),
+            )
+        } else {
+            format!(
+                "{:.2} GB of weights, gradients and moments per device; {:.2} GB with `optimizer: {{shard: true}}`; activations besides",
+                giga(cost.whole_state),
+                giga(cost.sharded_state),
+            )
+        },
         format!(
             "checkpoints take {:.2}% of the time (1 GB/s), one failure a day {:.2}% (half an interval, 10 min to restart)",
             100.0 * cost.checkpoints,

@@ -1,8 +1,8 @@
 //! What a training takes on many devices: a model of one step of data-parallel training, of its memory, and of what checkpoints and
 //! failures cost.
 //!
-//! A step is computing, which is divided by the number of devices, and a reduction of gradients, of which as much is hidden as
-//! overlaps with computing; `reviv` reduces after the backward pass, so that nothing is.
+//! A step is computing, which is divided by the number of devices, and a reduction of gradients. Buckets of gradients are on their way
+//! while backward computes the next ones: as much of the reduction is hidden as there is backward beside it, but never the last bucket.
 
 use serde::Serialize;
 
@@ -50,6 +50,8 @@ pub struct Training {
     pub flop: f64,
     /// Nominal tokens of a step.
     pub tokens: f64,
+    /// Each device keeps its share of the optimizer's moments alone (ZeRO stage 1).
+    pub sharded: bool,
 }
 
 /// What it runs on.
@@ -61,8 +63,10 @@ pub struct Cluster {
     pub rate: f64,
     /// What links them.
     pub interconnect: Interconnect,
-    /// Share of computing behind which the reduction can hide.
+    /// Share of computing behind which the reduction can hide: the backward passes after which devices add up gradients.
     pub overlap: f64,
+    /// How often devices exchange their gradients in a step: once, or after each of their micro-batches.
+    pub exchanges: f64,
     /// Bytes per second that one process writes to the file system.
     pub disk: f64,
     /// Steps between checkpoints.
@@ -80,7 +84,9 @@ pub struct Cost {
     pub compute: f64,
     /// Bytes that a device sends in a step.
     pub wire: f64,
-    /// Seconds of the reduction that nothing hides.
+    /// Seconds of the reduction, hidden or not.
+    pub reduction: f64,
+    /// Seconds of exchanges that nothing hides.
     pub exposed: f64,
     /// Computing's share of a step.
     pub efficiency: f64,
@@ -90,9 +96,9 @@ pub struct Cost {
     pub days_to_500_billion: f64,
     /// Days of the training as it is planned, with checkpoints and failures.
     pub days: f64,
-    /// Bytes per device of weights, gradients and two moments.
-    pub state: f64,
-    /// The same, were the moments sharded over devices (ZeRO-1).
+    /// Bytes per device of weights, gradients and two moments, all of them on each.
+    pub whole_state: f64,
+    /// The same where each has its share of the moments.
     pub sharded_state: f64,
     /// Share of the time that goes into writing checkpoints.
     pub checkpoints: f64,
@@ -107,13 +113,24 @@ impl Training {
         let n = cluster.devices;
         let gradient = F32 * self.parameters;
         let compute = self.flop / self.steps / (n * cluster.rate);
-        // A part of every bucket to each of the others, and the sums back.
-        let wire = 2.0 * gradient * (n - 1.0) / n;
+        // A part of every bucket to each of the others in each exchange, and the sums back.
+        let one = gradient * (n - 1.0) / n;
         let buckets = (gradient / (25.0 * 1024.0 * 1024.0)).ceil();
         let link = &cluster.interconnect;
-        let messages = 2.0 * buckets * (n - 1.0) * link.latency;
-        let reduction = wire / link.bytes_per_second + messages;
-        let exposed = (reduction - cluster.overlap * compute).max(0.0);
+        let seconds = |bytes: f64, times: f64| {
+            bytes / link.bytes_per_second + times * buckets * (n - 1.0) * link.latency
+        };
+        let travels = cluster.exchanges + 1.0;
+        let reduction = seconds(travels * one, travels);
+        let last = reduction / buckets;
+        let hidden = cluster.overlap * compute;
+        let mut exposed = (reduction - hidden).max(last);
+        let mut wire = travels * one;
+        if self.sharded {
+            // What each has moved goes to the others, when there is nothing left to compute.
+            wire += one;
+            exposed += seconds(one, 1.0);
+        }
         let step = compute + exposed;
         let tokens_per_second = self.tokens / step;
         let day = 86400.0;
@@ -127,12 +144,13 @@ impl Training {
         Cost {
             compute,
             wire,
+            reduction,
             exposed,
             efficiency: compute / step,
             tokens_per_second,
             days_to_500_billion: 500e9 / tokens_per_second / day,
             days: self.steps * step / useful / day,
-            state: 4.0 * gradient,
+            whole_state: 4.0 * gradient,
             sharded_state: 2.0 * gradient + 2.0 * gradient / n,
             checkpoints,
             failures,
@@ -156,6 +174,7 @@ mod tests {
         steps: 120_000.0,
         flop: 6.0 * 400e6 * 300e9,
         tokens: 1024.0 * 4096.0,
+        sharded: false,
     };
 
     fn cluster(devices: f64) -> Cluster {
@@ -164,6 +183,7 @@ mod tests {
             rate: 100e12,
             interconnect: INTERCONNECTS[1],
             overlap: 0.0,
+            exchanges: 1.0,
             disk: 1e9,
             checkpoint_every: 500.0,
             failures_per_day: 1.0,
@@ -175,7 +195,7 @@ mod tests {
     fn one_device_sends_nothing_and_computes_all() {
         let cost = LARGE.on(&cluster(1.0));
         assert_eq!((cost.wire, cost.exposed, cost.efficiency), (0.0, 0.0, 1.0));
-        assert_eq!(cost.state, cost.sharded_state);
+        assert_eq!(cost.whole_state, cost.sharded_state);
         let seconds = LARGE.flop / 100e12;
         assert!((cost.compute * LARGE.steps / seconds - 1.0).abs() < 1e-9);
     }
@@ -190,9 +210,36 @@ mod tests {
             overlap: 0.5,
             ..cluster(8.0)
         };
-        assert!(LARGE.on(&hidden).exposed < costs[1].exposed);
+        let hidden = LARGE.on(&hidden);
+        assert!(hidden.exposed < costs[1].exposed && hidden.reduction == costs[1].reduction);
+        // Nothing is left for the last of 62 buckets to hide behind.
+        let all = LARGE.on(&Cluster {
+            overlap: 1.0,
+            ..cluster(8.0)
+        });
+        assert!(
+            (all.exposed / all.reduction - 1.0 / 62.0).abs() < 1e-3,
+            "{all:?}"
+        );
         // Moments over 256 devices: half of the state, and hardly more.
-        assert!((costs[3].sharded_state / costs[3].state - 0.502).abs() < 1e-3);
+        assert!((costs[3].sharded_state / costs[3].whole_state - 0.502).abs() < 1e-3);
+    }
+
+    #[test]
+    fn shared_moments_and_exchanges_after_every_micro_batch_are_sent_too() {
+        let plain = LARGE.on(&cluster(8.0));
+        let sharded = Training {
+            sharded: true,
+            ..LARGE
+        };
+        let sharded = sharded.on(&cluster(8.0));
+        assert!((sharded.wire / plain.wire - 1.5).abs() < 1e-9);
+        assert!((sharded.exposed / plain.exposed - 1.5).abs() < 1e-9);
+        let ordered = LARGE.on(&Cluster {
+            exchanges: 4.0,
+            ..cluster(8.0)
+        });
+        assert!((ordered.wire / plain.wire - 2.5).abs() < 1e-9);
     }
 
     #[test]
