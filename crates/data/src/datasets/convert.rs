@@ -244,7 +244,8 @@ pub fn convert(
                     done += count;
                     converted.reused += 1;
                     converted.tally.add(tally);
-                    converted.interrupted = watch(&Progress { done, total }).is_break();
+                    converted.interrupted =
+                        watch(&Progress { done, total }).is_break() && done < total;
                 } else {
                     let mut clips = Shard {
                         outcomes: &mut *outcomes,
@@ -446,6 +447,30 @@ mod tests {
             (rest.interrupted, rest.tally.clips, rest.reused),
             (false, 19, 1)
         );
+    }
+
+    #[test]
+    fn a_stop_that_comes_when_everything_is_there_interrupts_nothing() {
+        let sink = Memory::default();
+        let settings = ConvertSettings {
+            clips_per_shard: 10,
+            skip_damaged: true,
+        };
+        let go = &mut |_: &Progress| ControlFlow::Continue(());
+        convert(&Numbers, &sink, &settings, Share::WHOLE, go).unwrap();
+        let stop = &mut |progress: &Progress| match progress.done {
+            25 => ControlFlow::Break(()),
+            _ => ControlFlow::Continue(()),
+        };
+        // The last shard is reused, and then made again.
+        for reused in [3, 2] {
+            let again = convert(&Numbers, &sink, &settings, Share::WHOLE, stop).unwrap();
+            assert_eq!(
+                (again.interrupted, again.reused, again.tally.clips),
+                (false, reused, 19)
+            );
+            sink.0.lock().unwrap().remove(&2);
+        }
     }
 
     #[test]
