@@ -65,7 +65,8 @@ pub fn status(source: &dyn ClipSource, split: &SplitSettings, stride: f64) -> St
         .iter()
         .filter(|(_, clips)| !clips.is_empty())
         .map(|(_, clips)| (clips.len() - 1) as f64 * stride.min(CLIP_SECONDS) + CLIP_SECONDS)
-        .sum();
+        // `sum` of nothing is -0.0, which prints as "-0.00 h".
+        .fold(0.0, |sum, seconds| sum + seconds);
     Status {
         source: source.name().to_owned(),
         recordings: recordings.len(),
@@ -75,5 +76,34 @@ pub fn status(source: &dyn ClipSource, split: &SplitSettings, stride: f64) -> St
         splits,
         excluded: source.excluded(),
         notes: source.notes(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::datasets::{Outcome, ReadError};
+
+    struct Nothing;
+
+    impl ClipSource for Nothing {
+        fn name(&self) -> &'static str {
+            "nothing"
+        }
+        fn len(&self) -> usize {
+            0
+        }
+        fn modalities(&self) -> Vec<String> {
+            Vec::new()
+        }
+        fn clip(&self, _: usize) -> Result<Outcome, ReadError> {
+            Err(ReadError::Settings("there is none".to_owned()))
+        }
+    }
+
+    #[test]
+    fn a_data_set_without_clips_has_zero_hours_and_not_minus_zero() {
+        let status = status(&Nothing, &SplitSettings::default(), 2.0);
+        assert_eq!(format!("{:.2}", status.hours), "0.00");
     }
 }
