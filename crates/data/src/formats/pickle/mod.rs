@@ -137,7 +137,8 @@ pub enum Global {
     Dictionary,
     /// A dictionary whose first argument makes missing values.
     DefaultDict,
-    /// `list`, `tuple`, `set`, `frozenset`, `torch.Size`: all of them hold the items of one other container.
+    /// `list`, `tuple`, `set`, `frozenset`, `torch.Size`, `torch.jit._pickle.build_intlist` and its kin: all of them hold the items
+    /// of one other container.
     Container,
     /// `bytes` and `bytearray`.
     Bytes,
@@ -183,8 +184,6 @@ pub enum Global {
     NumpyFromBuffer,
     /// `_codecs.encode`: bytes that an old protocol wrote as text.
     Encode,
-    /// `torch.jit._pickle.build_intlist` and its kin: the list itself.
-    TypedList,
     /// `torch.storage._load_from_bytes`
     StorageFromBytes,
     /// A class compiled by TorchScript, `__torch__.module.Class`, or one of chumpy or SciPy: nothing but its dictionary.
