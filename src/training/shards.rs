@@ -9,6 +9,7 @@
 use super::source::{DataError, TokenSample, TokenSource};
 use crate::formats::npy;
 use crate::formats::npz::Npz;
+use crate::formats::{TAR_CUT, tar_has_end};
 use crate::mget::MgetSpec;
 use crate::tokenizer::TokenGrid;
 use std::collections::BTreeMap;
@@ -140,8 +141,10 @@ fn directory(path: &Path) -> Result<Vec<(String, Member)>, DataError> {
     let length = file.metadata().map_err(refuse)?.len();
     let mut archive = tar::Archive::new(std::io::BufReader::new(file));
     let mut members = Vec::new();
+    let mut end: u64 = 0;
     for entry in archive.entries_with_seek().map_err(refuse)? {
         let entry = entry.map_err(refuse)?;
+        end = entry.raw_file_position().saturating_add(entry.size());
         let name = entry.path().map_err(refuse)?.to_string_lossy().into_owned();
         let Some((stem, zipped)) = name
             .strip_suffix(".npy")
@@ -166,6 +169,9 @@ fn directory(path: &Path) -> Result<Vec<(String, Member)>, DataError> {
             ));
         }
         members.push((stem.to_owned(), member));
+    }
+    if !tar_has_end(length, end) {
+        return Err(shard_error(path, &format!("byte {end}: {TAR_CUT}")));
     }
     Ok(members)
 }
@@ -310,6 +316,25 @@ mod tests {
         let error = shards.read(0).unwrap().check(&spec()).unwrap_err();
         let message = error.to_string();
         assert!(message.contains("camera/shard-000000.tar"), "{message}");
+    }
+
+    #[test]
+    fn a_shard_that_was_cut_between_two_clips_is_no_whole_one_with_fewer() {
+        let folder = tempfile::tempdir().unwrap();
+        write(
+            folder.path(),
+            "camera",
+            &[("a", vec![1, 2]), ("b", vec![3, 4])],
+        );
+        let path = folder.path().join("camera/shard-000000.tar");
+        let bytes = std::fs::read(&path).unwrap();
+        // Two members of a header and a block each, and two blocks for the end.
+        assert_eq!(bytes.len(), 6 * 512);
+        for blocks in [0, 2, 4] {
+            std::fs::write(&path, &bytes[..blocks * 512]).unwrap();
+            let error = Shards::open(folder.path(), "set", &spec()).unwrap_err();
+            assert!(error.to_string().contains(TAR_CUT), "{blocks}: {error}");
+        }
     }
 
     #[test]

@@ -9,6 +9,7 @@
 //! one at a time when asked for, in any order, so memory does not grow with the data. Tars are untrusted: a size is compared
 //! with the file before anything is allocated.
 
+use crate::formats::{TAR_CUT, tar_has_end};
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{BufWriter, Read, Seek, SeekFrom};
@@ -321,7 +322,7 @@ fn index(path: &Path, tar: u32) -> Result<Vec<(String, Place)>, ShardError> {
         reason,
     };
     let mut members = Vec::new();
-    let mut offset = 0;
+    let (mut offset, mut end) = (0, 0);
     for entry in archive
         .entries_with_seek()
         .map_err(|e| damaged(0, e.to_string()))?
@@ -335,6 +336,7 @@ fn index(path: &Path, tar: u32) -> Result<Vec<(String, Place)>, ShardError> {
                 format!("a member of {size} bytes in a file of {length}"),
             ));
         }
+        end = offset + size;
         if !entry.header().entry_type().is_file() {
             continue;
         }
@@ -347,6 +349,9 @@ fn index(path: &Path, tar: u32) -> Result<Vec<(String, Place)>, ShardError> {
             .ok_or_else(|| damaged(offset, format!("`{name}` is neither .npz nor .npy")))?;
         let place = Place { tar, offset, size };
         members.push((stem.to_owned(), place));
+    }
+    if !tar_has_end(length, end) {
+        return Err(damaged(end, TAR_CUT.to_owned()));
     }
     Ok(members)
 }
@@ -437,11 +442,19 @@ mod tests {
         writer.finish().unwrap();
         let path = folder.path().join("camera/world/shard-000000.tar");
         let good = std::fs::read(&path).unwrap();
-        let mut errors = 0;
-        for cut in [1, 300, 512, 800, 1300, 2500] {
+        // Between two members, too: a member is 1536 bytes with its header, and two empty blocks are the end.
+        for cut in [0, 1, 300, 512, 800, 1300, 1536, 2500, 4 * 1536] {
             std::fs::write(&path, &good[..cut]).unwrap();
-            errors += usize::from(Shards::open(folder.path()).is_err());
+            let message = Shards::open(folder.path()).unwrap_err().to_string();
+            assert!(
+                message.contains("shard-000000.tar") && message.contains("byte"),
+                "{cut}: {message}"
+            );
         }
+        // GNU tar, too, is content with one of them.
+        std::fs::write(&path, &good[..4 * 1536 + 512]).unwrap();
+        assert_eq!(Shards::open(folder.path()).unwrap().count("camera"), 4);
+        let mut errors = 0;
         for at in 0..600 {
             let mut bad = good.clone();
             bad[at] ^= 0x41;

@@ -162,6 +162,19 @@ pub fn is_plain_name(name: &str) -> bool {
     !matches!(name, "" | "." | "..") && name.len() <= 200 && !name.contains(odd)
 }
 
+/// Bytes of a block of a tar.
+const TAR_BLOCK: u64 = 512;
+/// What to say of a tar without its end.
+pub const TAR_CUT: &str =
+    "it ends without the empty block that ends a tar: it is cut short, or was never finished";
+
+/// Whether a tar of `length` bytes goes on behind its last member, which ends at byte `end`. One that was cut between two members has
+/// nothing there, and reads like a whole one with fewer members.
+pub fn tar_has_end(length: u64, end: u64) -> bool {
+    let padded = end.div_ceil(TAR_BLOCK).saturating_mul(TAR_BLOCK);
+    length >= padded.saturating_add(TAR_BLOCK)
+}
+
 /// A temporary file in `folder` that will be renamed, with the rights that a file made in place would have: the process's umask
 /// applies, where the default of `tempfile` would hide the file from colleagues.
 pub fn temporary_in(folder: &Path) -> std::io::Result<tempfile::NamedTempFile> {

@@ -3,6 +3,7 @@
 use crate::datasets::ReadError;
 use crate::datasets::recording::ColourFrames;
 use crate::formats::read_error::Position;
+use crate::formats::{TAR_CUT, tar_has_end};
 use crate::video::image::Image;
 use serde::de::DeserializeOwned;
 use std::collections::BTreeMap;
@@ -51,7 +52,7 @@ impl Tar {
         let length = file.metadata().map_err(io)?.len();
         let mut archive = ::tar::Archive::new(File::open(path).map_err(io)?);
         let (mut frames, mut shapes) = (BTreeMap::<u32, Frame>::new(), None);
-        let mut offset = 0;
+        let (mut offset, mut end) = (0, 0);
         let entries = archive
             .entries_with_seek()
             .map_err(|error| damaged(0, error.to_string()))?;
@@ -63,6 +64,7 @@ impl Tar {
                 let reason = format!("a member of {size} bytes in a file of {length}");
                 return Err(damaged(offset, reason));
             }
+            end = offset + size;
             let member = Member { offset, size };
             let name = entry.path_bytes();
             let name = String::from_utf8_lossy(&name);
@@ -90,6 +92,9 @@ impl Tar {
                     }
                 }
             }
+        }
+        if !tar_has_end(length, end) {
+            return Err(damaged(end, TAR_CUT.to_owned()));
         }
         if frames.is_empty() {
             return Err(damaged(
