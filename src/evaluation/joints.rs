@@ -39,6 +39,14 @@ impl Valid<'_> {
             Self::Joints(valid) => valid.dim() == (frames, joints),
         }
     }
+
+    fn shape(&self) -> Vec<usize> {
+        match self {
+            Self::All => Vec::new(),
+            Self::Frames(valid) => valid.shape().to_vec(),
+            Self::Joints(valid) => valid.shape().to_vec(),
+        }
+    }
 }
 
 /// Joint errors of one clip, in millimetres.
@@ -98,7 +106,7 @@ const MM: f64 = 1000.0;
 /// Errors of `pred` against `gt`, both `[T, J, 3]` in metres; `root` is the joint that RA subtracts (hand: wrist, body: pelvis).
 ///
 /// # Errors
-/// When the shapes differ, or a coordinate of a valid joint is not finite in either.
+/// When the shapes differ, there is no joint `root`, or a coordinate of a valid joint is not finite in either.
 pub fn joint_errors<T: Copy + Into<f64>>(
     pred: ArrayView3<T>,
     gt: ArrayView3<T>,
@@ -106,15 +114,25 @@ pub fn joint_errors<T: Copy + Into<f64>>(
     root: usize,
 ) -> Result<JointErrors, MetricError> {
     let (frames, joints, axes) = gt.dim();
-    if pred.dim() != gt.dim()
-        || axes != 3
-        || !valid.fits(frames, joints)
-        || (joints > 0 && root >= joints)
-    {
+    if pred.dim() != gt.dim() || axes != 3 {
         return Err(MetricError::Shape {
             field: "joints",
             found: pred.shape().to_vec(),
-            expected: gt.shape().to_vec(),
+            expected: vec![frames, joints, 3],
+        });
+    }
+    if !valid.fits(frames, joints) {
+        return Err(MetricError::Shape {
+            field: "validity of joints",
+            found: valid.shape(),
+            expected: vec![frames, joints],
+        });
+    }
+    if joints > 0 && root >= joints {
+        return Err(MetricError::Argument {
+            name: "root",
+            found: root as f64,
+            allowed: format!("below {joints}, the number of joints"),
         });
     }
     // Valid points of all frames, one after another; `ends[t]` closes frame t.
@@ -300,6 +318,22 @@ mod tests {
                 field: "prediction",
                 position: vec![4, 3]
             }
+        );
+    }
+
+    #[test]
+    fn a_root_that_is_no_joint_is_named_and_not_called_a_shape() {
+        let (pred, gt) = (motion("joints.pred"), motion("joints.gt"));
+        let refused = joint_errors(pred.view(), gt.view(), Valid::All, 21).unwrap_err();
+        assert_eq!(
+            refused.to_string(),
+            "`root` is 21; it must be below 21, the number of joints"
+        );
+        let short = ndarray::Array1::from_elem(9, true);
+        let refused = joint_errors(pred.view(), gt.view(), Valid::Frames(short.view()), 0);
+        assert_eq!(
+            refused.unwrap_err().to_string(),
+            "validity of joints: shape [9] does not fit [10, 21]"
         );
     }
 

@@ -102,7 +102,7 @@ pub enum MetricError {
         /// Its index in the trajectory, from 0.
         index: usize,
     },
-    /// Arrays that are compared do not fit, or an argument (a root joint, a step between poses) does not fit them.
+    /// Arrays that are compared do not fit.
     #[error("{field}: shape {found:?} does not fit {expected:?}")]
     Shape {
         /// What has the shape: `joints`, `gaze`, `embeddings`, ...
@@ -111,6 +111,16 @@ pub enum MetricError {
         found: Vec<usize>,
         /// The shape that was needed, usually the truth's.
         expected: Vec<usize>,
+    },
+    /// An argument beside the arrays is outside its range.
+    #[error("`{name}` is {found}; it must be {allowed}")]
+    Argument {
+        /// Its name: `root`, `delta`, `rate`.
+        name: &'static str,
+        /// What was given.
+        found: f64,
+        /// The range, in words: `below 21, the number of joints`.
+        allowed: String,
     },
     /// An embedding is all zeros, so that it has no cosine with another.
     #[error("embedding {row} has length zero: it has no direction")]

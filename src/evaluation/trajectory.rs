@@ -178,14 +178,27 @@ pub fn masked_trajectory_errors(
     delta: usize,
     freedom: Freedom,
 ) -> Result<TrajectoryErrors, MetricError> {
-    if estimate.len() != reference.len()
-        || valid.is_some_and(|v| v.len() != reference.len())
-        || delta == 0
-    {
-        return Err(MetricError::Shape {
-            field: "trajectory",
-            found: vec![estimate.len()],
-            expected: vec![reference.len()],
+    let lengths = [
+        ("trajectory", estimate.len()),
+        (
+            "validity of a trajectory",
+            valid.map_or(reference.len(), <[bool]>::len),
+        ),
+    ];
+    for (field, found) in lengths {
+        if found != reference.len() {
+            return Err(MetricError::Shape {
+                field,
+                found: vec![found],
+                expected: vec![reference.len()],
+            });
+        }
+    }
+    if delta == 0 {
+        return Err(MetricError::Argument {
+            name: "delta",
+            found: 0.0,
+            allowed: "at least 1 sample".to_owned(),
         });
     }
     let scored: Vec<usize> = (0..reference.len())
@@ -330,6 +343,22 @@ mod tests {
         estimate[20].position.x = f64::NAN;
         assert_eq!(before, errors(&estimate));
         assert_eq!((before.n_poses, before.n_pairs), (59, 57));
+    }
+
+    #[test]
+    fn a_step_of_no_samples_is_named_and_not_called_a_shape() {
+        let (a, b) = (walk("a"), walk("b"));
+        let refusal = trajectory_errors(&a, &b, 0, Freedom::Similarity).unwrap_err();
+        assert_eq!(
+            refusal.to_string(),
+            "`delta` is 0; it must be at least 1 sample"
+        );
+        let valid = [true; 59];
+        let refusal = masked_trajectory_errors(&a, &b, Some(&valid), 1, Freedom::Similarity);
+        assert_eq!(
+            refusal.unwrap_err().to_string(),
+            "validity of a trajectory: shape [59] does not fit [60]"
+        );
     }
 
     #[test]

@@ -127,10 +127,11 @@ impl Tmr {
             .collect())
     }
 
-    /// What features are computed from: 22 joints, y up, at the feature rate.
+    /// What features are computed from: 22 joints, y up, at the feature rate. With [`FeatureRate::Native`] the samples are taken as
+    /// they are: features are per frame step, and no rate enters them.
     ///
     /// # Errors
-    /// When the shape is not `[T, 21, 3]`, or the rate is none.
+    /// When the shape is not `[T, 21, 3]`, or the rate is not a positive number.
     pub fn input(
         &self,
         joints: ArrayView3<'_, f64>,
@@ -144,6 +145,13 @@ impl Tmr {
                 expected: vec![joints.len_of(Axis(0)), 21, 3],
             });
         }
+        if !(rate.is_finite() && rate > 0.0) {
+            return Err(MetricError::Argument {
+                name: "rate",
+                found: rate,
+                allowed: "a positive number of samples a second".to_owned(),
+            });
+        }
         let poses: Vec<Pose> = joints
             .outer_iter()
             .map(|pose| {
@@ -155,5 +163,39 @@ impl Tmr {
             FeatureRate::Native => poses,
             FeatureRate::Trained => at_rate(&poses, rate, TRAINED_RATE),
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::engine::{Compute, Initialise};
+    use ndarray::Array3;
+
+    #[test]
+    fn the_rate_decides_what_is_resampled_and_must_be_one() {
+        let settings = MotionEncoderSettings {
+            width: 8,
+            layers: 1,
+            heads: 1,
+            hidden: 8,
+        };
+        let encoder = MotionEncoder::new(&Initialise::new(&Compute::cpu(), 5), &settings).unwrap();
+        let tmr = Tmr::new(encoder, vec![0.0; FEATURES], vec![1.0; FEATURES]).unwrap();
+        let joints = Array3::from_shape_fn((60, 21, 3), |(t, j, k)| (t + 2 * j + 3 * k) as f64);
+        let frames = |rate, feature_rate| {
+            let input = tmr.input(joints.view(), rate, feature_rate);
+            input.map(|poses| poses.len())
+        };
+        assert_eq!(frames(30.0, FeatureRate::Trained), Ok(40));
+        assert_eq!(frames(60.0, FeatureRate::Trained), Ok(20));
+        // The motion's own samples, whatever their rate.
+        assert_eq!(frames(30.0, FeatureRate::Native), Ok(60));
+        for rate in [0.0, -30.0, f64::NAN, f64::INFINITY] {
+            for feature_rate in [FeatureRate::Trained, FeatureRate::Native] {
+                let message = frames(rate, feature_rate).unwrap_err().to_string();
+                assert!(message.contains("`rate`"), "{message}");
+            }
+        }
     }
 }
