@@ -12,7 +12,7 @@ use super::settings::DecodingSettings;
 /// so neither the batch nor the number of threads changes a token.
 ///
 /// # Errors
-/// When a name is unknown, samples do not fit the model or each other, or the model answers with NaN.
+/// When a name is unknown, samples do not fit the model or each other, or the model answers with a value that is not finite.
 pub fn generate<M: TokenModel>(
     model: &M,
     settings: &DecodingSettings,
@@ -138,6 +138,8 @@ mod tests {
     struct Toy {
         modalities: Vec<TokenModality>,
         encoded: Cell<usize>,
+        /// What stands in the place of every logit of token 2.
+        broken: Option<f32>,
     }
 
     fn toy() -> Toy {
@@ -153,6 +155,7 @@ mod tests {
                 modality("body", 21, 33),
             ],
             encoded: Cell::new(0),
+            broken: None,
         }
     }
 
@@ -218,7 +221,10 @@ mod tests {
                 .iter()
                 .flat_map(|&(context, p)| {
                     let mut rng = crate::random::stream(context, "toy", m as u64, u64::from(p));
-                    (0..vocabulary).map(move |_| 6.0 * rng.random::<f32>())
+                    (0..vocabulary).map(move |token| {
+                        let logit = 6.0 * rng.random::<f32>();
+                        self.broken.filter(|_| token == 2).unwrap_or(logit)
+                    })
                 })
                 .collect())
         }
@@ -276,6 +282,26 @@ mod tests {
                     ids(&other, "camera")[0],
                     ids(&both, "camera")[0],
                     "another seed"
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn logits_that_are_not_finite_are_refused_by_the_name_of_their_modality() {
+        for value in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+            let toy = Toy {
+                broken: Some(value),
+                ..toy()
+            };
+            for guidance in [1.0, 2.0] {
+                let mut settings = settings(Order::Independent, Scheme::Maskgit);
+                settings.all.guidance = guidance;
+                let error = generate(&toy, &settings, &[sample(1)], &["body"], 5).unwrap_err();
+                let message = error.to_string();
+                assert!(
+                    message.contains("`body`") && message.contains("not finite"),
+                    "{message}"
                 );
             }
         }

@@ -171,9 +171,9 @@ pub enum DecodingError {
         /// Tokens per sample of the modality.
         expected: usize,
     },
-    /// A logit is NaN.
+    /// A logit is NaN or infinite.
     #[error(
-        "the model answers with a value that is not a number for `{name}`; its weights are broken"
+        "the model answers with a value that is not finite for `{name}`; its weights are broken"
     )]
     NotFinite {
         /// The modality that was being decoded.

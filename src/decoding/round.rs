@@ -296,7 +296,8 @@ impl<'m, M: TokenModel> Samples<'m, M> {
                     trace.unconditional.extend_from_slice(&without);
                 }
             }
-            if logits.iter().any(|l| l.is_nan()) {
+            // Infinite ones too: the largest logit is subtracted before `exp`, and what is left of the others is nothing or NaN.
+            if logits.iter().any(|l| !l.is_finite()) {
                 return Err(DecodingError::NotFinite {
                     name: modality.name.clone(),
                 });
