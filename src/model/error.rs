@@ -40,19 +40,21 @@ pub enum ModelError {
         /// The hash of the files, 32 hexadecimal digits.
         found: String,
     },
-    /// A tokenizer gives another number of tokens per clip than the transformer was built for.
+    /// A tokenizer gives other tokens than the transformer was built for: another number per clip, or of other kinds.
     #[error(
-        "the tokenizer of `{modality}` has {found} tokens a clip of {vocabulary} kinds, the model expects {expected}"
+        "the tokenizer of `{modality}` has {found} tokens a clip of {vocabulary} kinds, the model expects {expected} of {expected_vocabulary}"
     )]
     OtherGrid {
         /// The modality of the tokenizer.
         modality: String,
         /// Tokens per clip of the tokenizer.
-        found: String,
+        found: usize,
         /// How many different tokens the tokenizer has.
         vocabulary: usize,
         /// Tokens per clip of the transformer.
-        expected: String,
+        expected: usize,
+        /// How many different tokens the transformer knows.
+        expected_vocabulary: usize,
     },
     /// The model does not know a modality that is asked for.
     #[error("no modality `{name}` in this model; it has: {known}")]

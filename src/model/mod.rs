@@ -131,7 +131,7 @@ impl Model {
     /// A transformer and the tokenizers it was trained on.
     ///
     /// # Errors
-    /// When a tokenizer has other tokens than the transformer predicts.
+    /// When a tokenizer has other tokens than the transformer predicts: another number of them, or of other kinds.
     pub fn new(mget: Mget, tokenizers: Tokenizers) -> Result<Self, ModelError> {
         let pathway = Pathway::of(mget.spec(), tokenizers.format());
         for slot in &mget.spec().modalities {
@@ -139,13 +139,19 @@ impl Model {
             let Some(tokenizer) = own.and_then(|name| tokenizers.get(name)) else {
                 continue;
             };
-            let count: usize = tokenizer.grid().iter().product();
-            if count != slot.count() {
+            // Raw video has no tokens, and none of its kinds.
+            let Some(expected_vocabulary) = slot.vocabulary() else {
+                continue;
+            };
+            let found: usize = tokenizer.grid().iter().product();
+            let vocabulary = tokenizer.vocabulary();
+            if (found, vocabulary) != (slot.count(), expected_vocabulary) {
                 return Err(ModelError::OtherGrid {
                     modality: slot.name.clone(),
-                    found: count.to_string(),
-                    vocabulary: tokenizer.vocabulary(),
-                    expected: slot.count().to_string(),
+                    found,
+                    vocabulary,
+                    expected: slot.count(),
+                    expected_vocabulary,
                 });
             }
         }
@@ -489,6 +495,64 @@ fn signals(modality: &dyn Modality, clips: &[Clip]) -> Result<Vec<Signal>, Model
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::engine::Initialise;
+    use crate::mget::{MgetSpec, Positions, Size};
+    use crate::tokenizer::TokenizerError;
+    use std::sync::Arc;
+
+    /// Says how its tokens are, and makes none.
+    struct Described(Vec<usize>, usize);
+
+    impl Tokenizer for Described {
+        fn modality(&self) -> &'static str {
+            "gaze"
+        }
+        fn grid(&self) -> &[usize] {
+            &self.0
+        }
+        fn vocabulary(&self) -> usize {
+            self.1
+        }
+        fn encode(&self, _: &[Signal]) -> Result<Vec<TokenGrid>, TokenizerError> {
+            Ok(Vec::new())
+        }
+        fn decode(&self, _: &[TokenGrid]) -> Result<Vec<Signal>, TokenizerError> {
+            Ok(Vec::new())
+        }
+        fn write(&self, _: &Path) -> Result<(), TokenizerError> {
+            Ok(())
+        }
+    }
+
+    #[test]
+    fn a_tokenizer_of_another_codebook_is_refused_as_one_of_another_length_is() {
+        let spec = MgetSpec {
+            size: Size {
+                width: 12,
+                heads: 2,
+                encoder_depth: 1,
+                decoder_depth: 1,
+                hidden: 0,
+            },
+            positions: Positions::Aligned,
+            modalities: vec![ModalitySpec::tokens("gaze", &[4], 7)],
+        };
+        let mget = Mget::new(&spec, &Initialise::new(&Compute::cpu(), 0)).unwrap();
+        let model = |tokens: usize, vocabulary: usize| {
+            let mut tokenizers = Tokenizers::new(ClipFormat::default());
+            tokenizers.insert(Arc::new(Described(vec![tokens], vocabulary)));
+            Model::new(mget.clone(), tokenizers)
+        };
+        assert!(model(4, 7).is_ok());
+        for (tokens, vocabulary) in [(5, 7), (4, 8), (4, 6)] {
+            let message = model(tokens, vocabulary).unwrap_err().to_string();
+            let said = format!("{tokens} tokens a clip of {vocabulary} kinds");
+            assert!(
+                message.contains(&said) && message.ends_with("4 of 7"),
+                "{message}"
+            );
+        }
+    }
 
     #[test]
     fn a_folder_that_is_no_model_says_so() {
