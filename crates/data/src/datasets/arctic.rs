@@ -175,7 +175,7 @@ impl Arctic {
         recording.span = Some((0, tick(rows as i64)));
         recording.cameras = vec![(0, MountedCamera::without_lens())];
         self.colour(name, facts, &head, rows, &mut recording)?;
-        self.hands(&parameters, split, &mut recording)?;
+        self.hands(&parameters, split, rows, &mut recording)?;
         Ok(recording)
     }
 
@@ -224,6 +224,15 @@ impl Arctic {
                     T_device_camera: Isometry3::identity(),
                 },
             )];
+        } else {
+            recording
+                .notes
+                .push("the lens of the head camera is not known".to_owned());
+        }
+        if labelled.len() < rows {
+            recording
+                .notes
+                .push("there are fewer pictures than rows of labels".to_owned());
         }
         let (rows, files): (Vec<i64>, Vec<PathBuf>) = labelled.into_iter().unzip();
         recording.colour = Some(Box::new(PictureFiles {
@@ -237,6 +246,7 @@ impl Arctic {
         &self,
         parameters: &Path,
         split: Option<&Split>,
+        rows: usize,
         recording: &mut Recording,
     ) -> Result<(), ReadError> {
         if let (Some(mano), true) = (&self.mano, parameters.is_file()) {
@@ -252,6 +262,7 @@ impl Arctic {
                 match mano.hand(side) {
                     Some(model) => {
                         let joints = from_mano(&pickle, hand, key, parameters, model)?;
+                        recording.notes.extend(fewer(key, joints.len(), rows));
                         recording.hands[side] = Some(Track::new(joints, MAX_GAP, HOLD));
                     }
                     None => recording.notes.extend(mano.note(side)),
@@ -260,6 +271,13 @@ impl Arctic {
         } else if let Some(split) = split {
             recording.hands_frame = JointFrame::Camera;
             for (side, joints) in split.hands()?.into_iter().enumerate() {
+                let key = ["left", "right"][side];
+                match &joints {
+                    Some(joints) => recording.notes.extend(fewer(key, joints.len(), rows)),
+                    None => recording.notes.push(format!(
+                        "there is no {key} hand of the sequence in `splits`"
+                    )),
+                }
                 recording.hands[side] = joints.map(|joints| Track::new(joints, MAX_GAP, HOLD));
             }
         } else if parameters.is_file() {
@@ -276,6 +294,11 @@ impl Arctic {
         recording.notes.extend(self.splits.notes());
         Ok(())
     }
+}
+
+/// What to say of a hand with fewer rows than the camera.
+fn fewer(hand: &str, found: usize, rows: usize) -> Option<String> {
+    (found < rows).then(|| format!("the {hand} hand has fewer rows than the camera"))
 }
 
 /// The head camera of a sequence.

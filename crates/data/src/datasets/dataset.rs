@@ -76,8 +76,9 @@ impl Recordings {
         let counted: Vec<Result<Counted, ReadError>> = folders
             .par_iter()
             .map(|folder| {
-                let recording = open(folder, &settings)?;
+                let mut recording = open(folder, &settings)?;
                 recording.check(&settings)?;
+                recording.notes.extend(recording.partial());
                 Ok(Counted {
                     clips: recording.clips(&settings),
                     modalities: recording.modalities(),

@@ -184,7 +184,7 @@ impl Arrays {
             recording.colour = Some(Box::new(Frames { video, times }));
         }
         if let Some(path) = files.get("camera") {
-            let poses = array(path)?.to_dim::<f64, ndarray::Ix3>()?;
+            let poses = dimensions::<ndarray::Ix3>(path)?;
             expect(path, poses.shape(), &[60, 4, 4])?;
             let mut samples = Vec::new();
             for (k, m) in poses.outer_iter().enumerate() {
@@ -196,7 +196,7 @@ impl Arrays {
             recording.cameras = vec![(0, MountedCamera::without_lens())];
         }
         if let Some(path) = files.get("gaze") {
-            let points = array(path)?.to_dim::<f64, ndarray::Ix2>()?;
+            let points = dimensions::<ndarray::Ix2>(path)?;
             expect(path, points.shape(), &[60, 2])?;
             let samples = points
                 .outer_iter()
@@ -338,7 +338,7 @@ pub(super) fn pose(
 }
 
 fn hand(path: &Path) -> Result<Track<Joints>, ReadError> {
-    let values = array(path)?.to_dim::<f64, ndarray::Ix3>()?;
+    let values = dimensions::<ndarray::Ix3>(path)?;
     // A fourth value is validity.
     let depth = values.shape()[2];
     expect(
@@ -377,6 +377,12 @@ pub(super) fn array(path: &Path) -> Result<NpyArray, ReadError> {
         .ok_or_else(|| ReadError::missing(path, "there are several arrays, and none is `arr_0`"))
 }
 
+/// The array of a file with so many axes.
+fn dimensions<D: ndarray::Dimension>(path: &Path) -> Result<ndarray::Array<f64, D>, ReadError> {
+    let array = array(path)?.to_dim::<f64, D>();
+    Ok(array.map_err(|error| error.in_file(path))?)
+}
+
 pub(super) fn expect(path: &Path, found: &[usize], wanted: &[usize]) -> Result<(), ReadError> {
     if found == wanted {
         return Ok(());
@@ -403,5 +409,6 @@ pub fn read_tokens(path: &Path, grid: &[usize]) -> Result<Vec<u32>, ReadError> {
             format!("tokens of shape {:?} instead of {grid:?}", tokens.shape),
         ));
     }
-    Ok(tokens.to::<u32>()?.into_raw_vec_and_offset().0)
+    let ids = tokens.to::<u32>().map_err(|error| error.in_file(path))?;
+    Ok(ids.into_raw_vec_and_offset().0)
 }

@@ -91,7 +91,7 @@ fn open(folder: &Path, mano: Option<&Mano>) -> Result<Recording, ReadError> {
         .map(|name| folder.join(name))
         .find(|pictures| pictures.is_dir());
     match pictures {
-        Some(pictures) => colour(&pictures, folder, &mut recording)?,
+        Some(pictures) => colour(&pictures, folder, poses.len(), &mut recording)?,
         None => recording
             .notes
             .push("there is no `rgb` and no `rgb256`: no pictures".to_owned()),
@@ -99,7 +99,15 @@ fn open(folder: &Path, mano: Option<&Mano>) -> Result<Recording, ReadError> {
     let depth = folder.join("depth");
     if depth.is_dir() {
         let (numbers, files): (Vec<u32>, Vec<_>) = numbered(&depth, &["png"])?.into_iter().unzip();
-        if !files.is_empty() && recording.colour.is_some() {
+        if files.is_empty() {
+            recording
+                .notes
+                .push("there are no pictures of depth in `depth`: no depth".to_owned());
+        } else if recording.colour.is_none() {
+            recording
+                .notes
+                .push("depth is left out: it has no pictures to go with".to_owned());
+        } else {
             recording.depth = Some(Box::new(DepthFiles {
                 times: numbers.into_iter().map(|k| tick(k.into())).collect(),
                 files,
@@ -111,11 +119,16 @@ fn open(folder: &Path, mano: Option<&Mano>) -> Result<Recording, ReadError> {
             .notes
             .push("there is no `depth`: no depth".to_owned());
     }
-    hands(folder, mano, &mut recording)?;
+    hands(folder, mano, poses.len(), &mut recording)?;
     Ok(recording)
 }
 
-fn colour(pictures: &Path, folder: &Path, recording: &mut Recording) -> Result<(), ReadError> {
+fn colour(
+    pictures: &Path,
+    folder: &Path,
+    poses: usize,
+    recording: &mut Recording,
+) -> Result<(), ReadError> {
     let (numbers, files): (Vec<u32>, Vec<_>) = numbered(pictures, &["png", "jpg", "jpeg"])?
         .into_iter()
         .unzip();
@@ -125,6 +138,11 @@ fn colour(pictures: &Path, folder: &Path, recording: &mut Recording) -> Result<(
             .push("its folder of pictures is empty".to_owned());
         return Ok(());
     };
+    if files.len() < poses {
+        recording
+            .notes
+            .push("there are fewer pictures than poses in `cam_pose`".to_owned());
+    }
     let intrinsics = folder.join("cam_intrinsics.txt");
     if intrinsics.is_file() {
         let (width, height) = picture_size(first)?;
@@ -206,18 +224,28 @@ fn lens(path: &Path) -> Result<Camera, ReadError> {
 }
 
 /// Joints of both hands in the camera: as they are written, else from their MANO parameters.
-fn hands(folder: &Path, mano: Option<&Mano>, recording: &mut Recording) -> Result<(), ReadError> {
+fn hands(
+    folder: &Path,
+    mano: Option<&Mano>,
+    poses: usize,
+    recording: &mut Recording,
+) -> Result<(), ReadError> {
     let mut samples: [Vec<(i64, Joints)>; 2] = Default::default();
+    let mut files = None;
     let (joints, parameters) = (folder.join("hand_pose"), folder.join("hand_pose_MANO"));
     if joints.is_dir() {
-        for (number, path) in numbered(&joints, &["txt"])? {
+        let found = numbered(&joints, &["txt"])?;
+        files = Some(("hand_pose", found.len()));
+        for (number, path) in found {
             let numbers = numbers(&path, 2 * HAND)?;
             for (samples, hand) in samples.iter_mut().zip(numbers.chunks_exact(HAND)) {
                 samples.push((tick(number.into()), written(hand)));
             }
         }
     } else if let (true, Some(mano)) = (parameters.is_dir(), mano) {
-        for (number, path) in numbered(&parameters, &["txt"])? {
+        let found = numbered(&parameters, &["txt"])?;
+        files = Some(("hand_pose_MANO", found.len()));
+        for (number, path) in found {
             let numbers = numbers(&path, 2 * HAND_MANO)?;
             for (side, hand) in numbers.chunks_exact(HAND_MANO).enumerate() {
                 samples[side].push((tick(number.into()), from_mano(hand, mano, side)));
@@ -237,6 +265,15 @@ fn hands(folder: &Path, mano: Option<&Mano>, recording: &mut Recording) -> Resul
         recording.notes.push(
             "there is no `hand_pose`: no hands (subject 4 has none, it is the test)".to_owned(),
         );
+    }
+    match files {
+        Some((name, 0)) => recording
+            .notes
+            .push(format!("there are no files in `{name}`: no hands")),
+        Some((name, count)) if count < poses => recording.notes.push(format!(
+            "there are fewer files in `{name}` than poses in `cam_pose`"
+        )),
+        _ => {}
     }
     recording.hands_frame = JointFrame::Camera;
     recording.hands =

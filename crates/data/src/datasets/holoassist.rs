@@ -34,6 +34,9 @@ const TICKS: f64 = 1e7;
 /// A row this far before the first picture or after the last, in ticks, still shows it: the streams do not start together.
 const PICTURE_APART: i64 = 2_500_000;
 
+/// A video that goes on for longer than this after the last row, in ticks, has lost rows.
+const MISSING_CLOCK: i64 = 10_000_000;
+
 /// Opens the sessions at or below `root`.
 ///
 /// # Errors
@@ -123,7 +126,23 @@ fn open_with(folder: &Path, decoder: DecoderChoice) -> Result<Recording, ReadErr
         let video = Video::open_with(&path, &VideoSettings::by(decoder))?;
         size = Some((video.info().width, video.info().height));
         match start_of(&export)? {
-            Some(start) => recording.colour = rows_as_frames(video, start, &poses).map(boxed),
+            Some(start) => {
+                // A clock that was cut short is whole to its reader, and so is what follows it: only the video goes on.
+                let shown = start.saturating_add((video.info().seconds() * TICKS) as i64);
+                let clock = poses[poses.len() - 1].tick;
+                if shown.saturating_sub(clock) > MISSING_CLOCK {
+                    recording.notes.push(
+                        "the video goes on for more than a second after the last row of `Video/Pose_sync.txt`".to_owned(),
+                    );
+                }
+                recording.colour = rows_as_frames(video, start, &poses).map(boxed);
+                if recording.colour.is_none() {
+                    recording.notes.push(
+                        "no row of `Video/Pose_sync.txt` is at a time of the video: no pictures"
+                            .to_owned(),
+                    );
+                }
+            }
             None => recording.notes.push(
                 "there is no `Video/VideoMp4Timing.txt`, which says when the video begins: no pictures".to_owned(),
             ),
@@ -160,6 +179,9 @@ fn open_with(folder: &Path, decoder: DecoderChoice) -> Result<Recording, ReadErr
             continue;
         }
         let hand = tables::hand(&path)?;
+        recording
+            .notes
+            .extend(ends_early(&format!("Hands/{file}"), hand.last, last));
         if hand.flags_unused {
             recording.notes.push(format!(
                 "`Hands/{file}` flags no joint as valid in any row: its flags are not used"
@@ -173,6 +195,12 @@ fn open_with(folder: &Path, decoder: DecoderChoice) -> Result<Recording, ReadErr
         recording.gaze = gaze(&export, &lens, &poses, &mut recording.notes)?;
     }
     Ok(recording)
+}
+
+/// What to say of a table whose last row is more than a second before the clock's.
+fn ends_early(file: &str, last: i64, clock: i64) -> Option<String> {
+    (clock.saturating_sub(last) > SECOND)
+        .then(|| format!("`{file}` ends more than a second before `Video/Pose_sync.txt`"))
 }
 
 fn boxed(frames: RowFrames) -> Box<dyn ColourFrames> {

@@ -32,6 +32,8 @@ pub const DEPTH_APART: i64 = SECOND / 100;
 const GAZE_RANGE: std::ops::RangeInclusive<f64> = -0.2..=1.2;
 /// Two frames are equally near when their distances differ by less than clocks are rounded, nanoseconds.
 const TIE: i64 = 2000;
+/// A signal that ends this long before the recording does, or begins as long after it, is there for a part of it.
+const PARTLY: i64 = SECOND;
 /// Nanoseconds of a clip.
 const CLIP: i64 = CLIP_SECONDS as i64 * SECOND;
 
@@ -221,6 +223,40 @@ impl Recording {
     /// Notes what is absent, in one sentence.
     pub fn lacks(&mut self, what: impl Into<String>) {
         self.notes.push(what.into());
+    }
+
+    /// Signals that are known for a part of the recording or not at all, one sentence each: a file that was cut short at the end of a
+    /// line or row is a whole file to its reader.
+    #[must_use]
+    pub fn partial(&self) -> Vec<String> {
+        let depth = self.depth.as_ref().map(|depth| depth.times());
+        // Hands come and go: only those that never come are worth a sentence.
+        let [left, right] = [0, 1].map(|side| self.hands[side].as_ref().map(Track::times));
+        let signals = [
+            ("camera", self.device.as_ref().map(Track::times), true),
+            ("gaze", self.gaze.as_ref().map(Track::times), true),
+            ("body", self.body.as_ref().map(Track::times), true),
+            ("depth", depth, true),
+            ("left_hand", left, false),
+            ("right_hand", right, false),
+        ];
+        let mut sentences = Vec::new();
+        for (name, times, lasting) in signals {
+            match (times, self.extent()) {
+                (Some([]), _) => sentences.push(format!("not one sample of {name} is known")),
+                (Some([first, rest @ ..]), Some((start, end))) if lasting => {
+                    let last = rest.last().unwrap_or(first);
+                    let late = first.saturating_sub(start) > PARTLY;
+                    if late || end.saturating_sub(*last) > PARTLY {
+                        sentences.push(format!(
+                            "{name} is known for a part of the recording only: its samples begin late or end early by more than a second"
+                        ));
+                    }
+                }
+                _ => {}
+            }
+        }
+        sentences
     }
 
     /// Whether clips can be cut as `settings` ask.

@@ -57,6 +57,8 @@ pub(super) fn poses(path: &Path) -> Result<Vec<PoseRow>, ReadError> {
 
 /// One hand over time, in the world.
 pub(super) struct Hand {
+    /// Of the last row, whether the hand is in it or not, nanoseconds.
+    pub last: i64,
     pub samples: Vec<(i64, Joints)>,
     /// Not one joint of one row is flagged as valid: the export did not fill the flags.
     pub flags_unused: bool,
@@ -67,7 +69,9 @@ pub(super) fn hand(path: &Path) -> Result<Hand, ReadError> {
     let state_columns = |columns: usize| columns.checked_sub(AFTER_STATE + 2);
     let fits = |columns: usize| state_columns(columns).is_some_and(|n| (1..=4).contains(&n));
     let mut samples: Vec<(i64, Joints, u32)> = Vec::new();
+    let mut last = i64::MIN;
     each_row(path, &fits, |time, row| {
+        last = time;
         let first = row.len() - AFTER_STATE;
         let mut active = false;
         for column in 2..first {
@@ -106,6 +110,7 @@ pub(super) fn hand(path: &Path) -> Result<Hand, ReadError> {
         })
         .collect();
     Ok(Hand {
+        last,
         samples,
         flags_unused,
     })
