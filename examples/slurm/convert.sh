@@ -12,8 +12,8 @@ set -euo pipefail
 recordings=$1
 clips=$2
 shift 2
-# Scheduler variables count from the array's own first number.
+# An array's numbers may start anywhere and leave gaps of a step (`--array=0-30:2`); parts are 1 to n.
 parts=${SLURM_ARRAY_TASK_COUNT:-1}
-part=$((${SLURM_ARRAY_TASK_ID:-1} - ${SLURM_ARRAY_TASK_MIN:-1} + 1))
+part=$(((${SLURM_ARRAY_TASK_ID:-1} - ${SLURM_ARRAY_TASK_MIN:-1}) / ${SLURM_ARRAY_TASK_STEP:-1} + 1))
 
 exec reviv data convert "$recordings" -o "$clips" --shard "$part/$parts" "$@"

@@ -14,6 +14,9 @@ set -euo pipefail
 experiment=${1:?usage: sbatch --array=1-N data_array.sh EXPERIMENT [OPTION ...]}
 shift
 
+# An array's numbers may start anywhere and leave gaps of a step (`--array=0-30:2`); parts are 1 to n.
+step=${SLURM_ARRAY_TASK_STEP:-1}
+part=$(((SLURM_ARRAY_TASK_ID - SLURM_ARRAY_TASK_MIN) / step + 1))
+
 export RAYON_NUM_THREADS=${SLURM_CPUS_PER_TASK:-1}
-srun --ntasks=1 reviv run "$experiment" \
-    --shard "$SLURM_ARRAY_TASK_ID/$SLURM_ARRAY_TASK_COUNT" "$@"
+srun --ntasks=1 reviv run "$experiment" --shard "$part/$SLURM_ARRAY_TASK_COUNT" "$@"

@@ -36,6 +36,8 @@ mod schema;
 mod shared;
 mod shipped;
 mod skipped;
+#[cfg(unix)]
+mod slurm;
 mod statistics;
 mod sweep_compare;
 mod sweeps;
