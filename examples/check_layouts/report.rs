@@ -1,43 +1,15 @@
 //! What was compared, and how far off it was.
 
+use super::checks::Row;
 use std::fmt;
-
-/// One compared quantity of one golden file.
-#[derive(Debug, Clone)]
-struct Row {
-    /// `nymeria`.
-    set: String,
-    /// `golden camera`.
-    name: String,
-    /// The largest difference, or the number of wrong elements where everything must be equal.
-    error: f64,
-    /// The largest difference that passes; 0 where everything must be equal.
-    tolerance: f64,
-    unit: &'static str,
-    /// Why it fails whatever the difference.
-    problem: Option<String>,
-}
-
-impl Row {
-    fn passed(&self) -> bool {
-        self.problem.is_none() && self.error <= self.tolerance
-    }
-
-    /// The share of the tolerance that is used up.
-    fn badness(&self) -> f64 {
-        if self.passed() {
-            self.error / self.tolerance.max(f64::MIN_POSITIVE)
-        } else {
-            f64::INFINITY
-        }
-    }
-}
 
 /// All compared quantities, set by set.
 #[derive(Debug, Clone, Default)]
 pub struct Report {
+    /// What is added belongs to it.
     set: String,
-    rows: Vec<Row>,
+    /// By set.
+    rows: Vec<(String, Row)>,
 }
 
 impl Report {
@@ -48,9 +20,8 @@ impl Report {
 
     /// Adds the largest difference of numbers. NaN fails.
     pub fn difference(&mut self, name: &str, error: f64, tolerance: f64, unit: &'static str) {
-        self.rows.push(Row {
-            set: self.set.clone(),
-            name: name.to_owned(),
+        self.add(Row {
+            name: format!("{} {name}", self.set),
             error,
             tolerance,
             unit,
@@ -68,55 +39,34 @@ impl Report {
 
     /// Adds a row that fails for a reason other than a difference.
     pub fn problem(&mut self, name: &str, problem: &str) {
-        self.rows.push(Row {
-            set: self.set.clone(),
-            name: name.to_owned(),
-            error: 0.0,
-            tolerance: 0.0,
-            unit: "",
-            problem: Some(problem.to_owned()),
-        });
+        let name = format!("{} {name}", self.set);
+        self.add(Row::failed(name, problem.to_owned()));
+    }
+
+    fn add(&mut self, row: Row) {
+        self.rows.push((self.set.clone(), row));
     }
 
     /// Whether everything agrees (and anything was compared).
     pub fn passed(&self) -> bool {
-        !self.rows.is_empty() && self.rows.iter().all(Row::passed)
-    }
-}
-
-impl fmt::Display for Row {
-    fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let verdict = if self.passed() { "ok  " } else { "FAIL" };
-        let name = format!("{} {}", self.set, self.name);
-        write!(out, "{verdict}  {name:<56} ")?;
-        match &self.problem {
-            Some(problem) => write!(out, "{problem}"),
-            None if self.tolerance == 0.0 => write!(out, "{} elements differ", self.error),
-            None => write!(
-                out,
-                "{:.2e} of {:.0e} {}",
-                self.error, self.tolerance, self.unit
-            ),
-        }
+        !self.rows.is_empty() && self.rows.iter().all(|(_, row)| row.passed())
     }
 }
 
 impl fmt::Display for Report {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        for row in &self.rows {
+        for (_, row) in &self.rows {
             writeln!(out, "{row}")?;
         }
         writeln!(out)?;
-        let mut sets: Vec<&str> = self.rows.iter().map(|row| row.set.as_str()).collect();
-        sets.dedup();
-        for set in sets {
-            let rows = self.rows.iter().filter(|row| row.set == set);
+        for rows in self.rows.chunk_by(|(a, _), (b, _)| a == b) {
+            let rows = rows.iter().map(|(_, row)| row);
             let worst = rows.max_by(|a, b| a.badness().total_cmp(&b.badness()));
             if let Some(worst) = worst {
                 writeln!(out, "worst: {worst}")?;
             }
         }
-        let passed = self.rows.iter().filter(|row| row.passed()).count();
+        let passed = self.rows.iter().filter(|(_, row)| row.passed()).count();
         writeln!(out, "{passed}/{} passed", self.rows.len())
     }
 }

@@ -126,6 +126,7 @@ fn averages(file: &Value, report: &mut Report) -> Outcome {
                     name: format!("mask/statistics {name} component {index} {what}"),
                     error,
                     tolerance: STANDARD_ERRORS,
+                    unit: "",
                     problem: None,
                 });
             };

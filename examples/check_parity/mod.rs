@@ -1,5 +1,8 @@
-//! One file per folder of vectors; [`report`] and [`vectors`] are what they share.
+//! One file per folder of vectors; [`report`] and [`vectors`] are what they share, [`checks`] what they share with other
+//! checks.
 
+#[path = "../checks/mod.rs"]
+mod checks;
 pub mod report;
 pub mod vectors;
 
@@ -19,10 +22,8 @@ use std::path::Path;
 
 use reviv::engine::Compute;
 
+pub use checks::Outcome;
 use report::Report;
-
-/// An error of the check itself: a file that cannot be read, a model that cannot be built.
-pub type Outcome<T = ()> = Result<T, Box<dyn std::error::Error>>;
 
 /// Compares one folder.
 type Check = fn(&Path, &mut Report) -> Outcome;
@@ -53,30 +54,9 @@ fn compute() -> Compute {
 /// Lets `compute` compute everything below `folder`: one known folder, or a set of them; compares.
 pub fn check(folder: &Path, compute: &Compute) -> Outcome<Report> {
     DEVICE.set(compute.clone());
-    let folder = &folder
-        .canonicalize()
-        .map_err(|error| format!("{}: {error}", folder.display()))?;
     let mut report = Report::default();
-    let own = folder.file_name().and_then(|name| name.to_str());
-    if let Some((_, check)) = FOLDERS.iter().find(|(name, _)| Some(*name) == own) {
-        check(folder, &mut report)?;
-        return Ok(report);
-    }
-    let present: Vec<_> = FOLDERS
-        .iter()
-        .filter(|(name, _)| folder.join(name).is_dir())
-        .collect();
-    if present.is_empty() {
-        let known: Vec<&str> = FOLDERS.iter().map(|(name, _)| *name).collect();
-        return Err(format!(
-            "{} is none of, and holds none of: {}",
-            folder.display(),
-            known.join(" ")
-        )
-        .into());
-    }
-    for (name, check) in present {
-        check(&folder.join(name), &mut report)?;
+    for (_, check, folder) in checks::subjects(folder, FOLDERS)? {
+        check(&folder, &mut report)?;
     }
     Ok(report)
 }

@@ -1,34 +1,7 @@
 //! What was compared, and how far off it was.
 
+pub use super::checks::Row;
 use std::fmt;
-
-/// One compared tensor.
-#[derive(Debug, Clone)]
-pub struct Row {
-    /// `vq/body recon`.
-    pub name: String,
-    /// Relative error, or the number of wrong elements where everything must be equal.
-    pub error: f64,
-    /// The largest error that passes; 0 where everything must be equal.
-    pub tolerance: f64,
-    /// Why it fails whatever the error: a wrong shape, a value that is not finite, a tensor nobody compared.
-    pub problem: Option<String>,
-}
-
-impl Row {
-    fn passed(&self) -> bool {
-        self.problem.is_none() && self.error <= self.tolerance
-    }
-
-    /// How bad it is: the share of the tolerance that is used up.
-    fn badness(&self) -> f64 {
-        if self.passed() {
-            self.error / self.tolerance.max(f64::MIN_POSITIVE)
-        } else {
-            f64::INFINITY
-        }
-    }
-}
 
 /// All compared tensors.
 #[derive(Debug, Clone, Default)]
@@ -43,12 +16,7 @@ impl Report {
 
     /// Adds a row that fails for a reason other than an error.
     pub fn problem(&mut self, name: String, problem: String) {
-        self.add(Row {
-            name,
-            error: 0.0,
-            tolerance: 0.0,
-            problem: Some(problem),
-        });
+        self.add(Row::failed(name, problem));
     }
 
     /// Compares numbers by `||a - b|| / ||b||` (or `||a - b||` if b is 0).
@@ -69,6 +37,7 @@ impl Report {
             name,
             error,
             tolerance,
+            unit: "",
             problem: None,
         });
     }
@@ -84,6 +53,7 @@ impl Report {
             name,
             error: wrong as f64,
             tolerance: 0.0,
+            unit: "",
             problem: None,
         });
     }
@@ -99,13 +69,7 @@ impl fmt::Display for Report {
         let mut rows: Vec<&Row> = self.rows.iter().collect();
         rows.sort_by(|a, b| a.badness().total_cmp(&b.badness()));
         for row in &rows {
-            let verdict = if row.passed() { "ok  " } else { "FAIL" };
-            write!(out, "{verdict}  {:<60} ", row.name)?;
-            match &row.problem {
-                Some(problem) => writeln!(out, "{problem}")?,
-                None if row.tolerance == 0.0 => writeln!(out, "{} elements differ", row.error)?,
-                None => writeln!(out, "{:.2e} of {:.0e}", row.error, row.tolerance)?,
-            }
+            writeln!(out, "{row}")?;
         }
         let failed = rows.iter().filter(|row| !row.passed()).count();
         let worst = rows.last().map_or("", |row| row.name.as_str());
