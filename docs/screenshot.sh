@@ -4,7 +4,7 @@
 set -eu
 cd "$(dirname "$0")/.."
 run=${1:-$(ls -td runs/*-wearer-*/ | head -n 1)}
-page=$(cargo run --release --quiet -- view "$run")
+page=$(cargo run --release --quiet -- view --print "$run")
 browser=$(command -v chromium || command -v chromium-browser || command -v google-chrome)
 "$browser" --headless --no-sandbox --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader \
     --window-size=1280,800 --virtual-time-budget=8000 --screenshot=docs/view.png "file://$(realpath "$page")#t=1.0"

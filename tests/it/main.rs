@@ -62,6 +62,8 @@ mod run_text;
 mod tensorboard;
 mod tokenizer_ops;
 mod view;
+#[cfg(all(unix, not(target_os = "macos")))]
+mod view_command;
 mod vq_structure;
 mod world;
 
