@@ -17,6 +17,7 @@ mod plan_devices;
 mod ranks;
 mod reconstruct;
 mod request;
+mod rerun;
 mod run;
 mod schema;
 mod show;
@@ -32,6 +33,7 @@ use std::process::ExitCode;
 
 pub use compare::entrants_of;
 pub use reconstruct::{artifact_of, find_model};
+pub use rerun::python_is;
 pub use terminal::{Failure, Terminal};
 
 /// A command, parsed.

@@ -1,6 +1,7 @@
 //! `reviv reconstruct`: `experiments/reconstruct.yaml` with a video and a model.
 
 use super::request::open;
+use super::rerun;
 use super::run::{RunsDir, interruptible, progress, tell};
 use super::terminal::{Failure, Terminal};
 use crate::engine::DeviceChoice;
@@ -66,7 +67,8 @@ pub struct Reconstruct {
     /// Also draw skeleton, hands and gaze into the video: `overlay.mp4`, or `overlay.avi` where there is no `ffmpeg`
     #[arg(long = "video")]
     overlay: bool,
-    /// Also write for another program: `nerfstudio` makes a data set of pictures and cameras (`ns-train splatfacto --data DIR`)
+    /// Also write for another program: `nerfstudio` makes a data set of pictures and cameras (`ns-train splatfacto --data DIR`),
+    /// `rerun` a recording `scene.rrd`, by the Python package and its `rerun-sdk`
     #[arg(long, value_enum, value_name = "PROGRAM")]
     export: Vec<Export>,
     /// Who decodes the video
@@ -92,6 +94,7 @@ pub struct Reconstruct {
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 enum Export {
     Nerfstudio,
+    Rerun,
 }
 
 impl super::Run for Reconstruct {
@@ -104,6 +107,9 @@ impl super::Run for Reconstruct {
             ));
         }
         let target = self.target()?;
+        if self.export.contains(&Export::Rerun) {
+            rerun::check()?;
+        }
         let model = find_model(&self.place.runs, self.model.as_deref())
             .map_err(|error| tell(terminal, &error))?;
         let request = self.request(&model)?;
@@ -153,14 +159,18 @@ impl Reconstruct {
         }
     }
 
-    /// What needs the video once more, beside the result: the overlay, and pictures for other programs.
+    /// What is asked for beside the result: the overlay and pictures, which need the video once more, and files for other programs.
     fn write_more(
         &self,
         terminal: &Terminal,
         outcome: &Outcome,
         target: &Path,
     ) -> Result<(), Failure> {
-        if !self.overlay && self.export.is_empty() {
+        if self.export.contains(&Export::Rerun) {
+            rerun::write(target)?;
+        }
+        let pictures = self.export.contains(&Export::Nerfstudio);
+        if !self.overlay && !pictures {
             return Ok(());
         }
         let name = OVERLAYS[usize::from(!movie::ffmpeg())];
@@ -172,12 +182,8 @@ impl Reconstruct {
             if self.overlay {
                 Overlay::open(target)?.write(&video, &target.join(name))?;
             }
-            for export in &self.export {
-                match export {
-                    Export::Nerfstudio => {
-                        write_nerfstudio(target, &video, &target.join(NERFSTUDIO))?;
-                    }
-                }
+            if pictures {
+                write_nerfstudio(target, &video, &target.join(NERFSTUDIO))?;
             }
             Ok(())
         };
@@ -266,13 +272,11 @@ impl Reconstruct {
         if let Some(name) = OVERLAYS.iter().find(|name| target.join(name).is_file()) {
             let _ = writeln!(text, "\n{:<12}{}", "Overlay", target.join(name).display());
         }
-        if target.join(NERFSTUDIO).is_dir() {
-            let _ = writeln!(
-                text,
-                "{:<12}{}",
-                "NerfStudio",
-                target.join(NERFSTUDIO).display()
-            );
+        for (program, made) in [("NerfStudio", NERFSTUDIO), ("Rerun", rerun::FILE)] {
+            let made = target.join(made);
+            if made.exists() {
+                let _ = writeln!(text, "{program:<12}{}", made.display());
+            }
         }
         terminal.note(text);
         terminal.data(format_args!("{}\n", target.join(PAGE).display()));
@@ -411,6 +415,7 @@ fn earlier(target: &Path) -> Option<Vec<PathBuf>> {
     let own = |file: &PathBuf| {
         file == Path::new(MANIFEST)
             || file.starts_with(NERFSTUDIO)
+            || file == Path::new(rerun::FILE)
             || OVERLAYS.iter().any(|name| file == Path::new(name))
             || manifest.files.iter().any(|name| file == Path::new(name))
     };

@@ -433,3 +433,40 @@ fn a_video_whose_name_is_no_text_is_reconstructed_too() {
         .success();
     assert!(place.path("one/camera.tum").is_file());
 }
+
+#[cfg(unix)]
+#[test]
+fn a_recording_for_rerun_is_written_by_python_and_refused_before_the_work_without() {
+    use std::os::unix::fs::PermissionsExt as _;
+    let place = Place::new();
+    pictures(&place.path("walk"), 4, [40, 40], false);
+    let missing = place
+        .command("walk", "out")
+        .args(["--export", "rerun"])
+        .env("REVIV_PYTHON", place.path("no_python"))
+        .assert()
+        .code(1);
+    let said = String::from_utf8_lossy(&missing.get_output().stderr).into_owned();
+    assert!(
+        said.contains("no_python") && said.contains("pip install . rerun-sdk"),
+        "{said}"
+    );
+    assert!(!place.path("out").exists());
+
+    let script = place.path("python");
+    let text = "#!/bin/sh\n[ \"$1 $2\" = '-m reviv.rerun' ] || exit 3\nshift 2\n\
+                [ \"$1\" = --check ] && exit 0\n[ -f \"$1/view.html\" ] && printf rrd > \"$3\"\n";
+    std::fs::write(&script, text).unwrap();
+    std::fs::set_permissions(&script, std::fs::Permissions::from_mode(0o755)).unwrap();
+    for _ in 0..2 {
+        // Asked again, the recording is no foreign file.
+        place
+            .command("walk", "out")
+            .args(["--export", "rerun"])
+            .env("REVIV_PYTHON", &script)
+            .assert()
+            .success();
+        let made = std::fs::read_to_string(place.path("out/scene.rrd"));
+        assert_eq!(made.unwrap(), "rrd");
+    }
+}

@@ -37,10 +37,13 @@ mod _reviv {
 }
 
 /// The command line with these arguments, the first of which is the program's name; `module` is the file of this module, which
-/// the record of a run names as its program. Returns the exit code.
+/// the record of a run names as its program, `python` what runs it (empty for unknown). Returns the exit code.
 #[pyfunction]
-fn main(py: Python<'_>, arguments: Vec<OsString>, module: PathBuf) -> u8 {
+fn main(py: Python<'_>, arguments: Vec<OsString>, module: PathBuf, python: PathBuf) -> u8 {
     reviv::run::environment::program_is(module);
+    if !python.as_os_str().is_empty() {
+        reviv::cli::python_is(python);
+    }
     py.detach(|| reviv::cli::main_with(arguments))
 }
 

@@ -7,9 +7,11 @@ use crate::progress::Progress;
 use ndarray::{ArrayView1, ArrayView2, ArrayView3, IxDyn};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
+use reviv::geometry::rigid::Rigid;
 use reviv::geometry::skeleton::{BODY, HAND, JOINTS, Joints};
 use reviv::reconstruction::frame_buffer::DepthFrames;
 use reviv::reconstruction::lens::LensSettings;
+use reviv::reconstruction::stitch::Tracks;
 use reviv::reconstruction::tracks::SignalTrack;
 use reviv::reconstruction::{
     Anchor, Part, ReconstructError, ReconstructOptions, Recording, reconstruct_recording,
@@ -61,11 +63,8 @@ impl Reconstruction {
         if poses.is_empty() {
             return Ok(None);
         }
-        let rows = poses.iter().flat_map(|pose| {
-            let matrix = pose.to_homogeneous();
-            (0..16).map(move |k| matrix[(k / 4, k % 4)])
-        });
-        owned(py, IxDyn(&[poses.len(), 4, 4]), rows.collect()).map(Some)
+        let rows = poses.iter().flat_map(matrix).collect();
+        owned(py, IxDyn(&[poses.len(), 4, 4]), rows).map(Some)
     }
 
     /// `[T, 2]`: a view.
@@ -136,6 +135,54 @@ impl Reconstruction {
         Ok(found)
     }
 
+    /// Every sample by modality, `[N, T, ...]`; empty where none were asked for.
+    fn samples<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let all = self.made.samples();
+        let found = PyDict::new(py);
+        let least = |count: fn(&Tracks) -> usize| all.iter().map(count).min().unwrap_or(0);
+        let moments = least(|tracks| tracks.camera().len());
+        if moments > 0 {
+            let poses = all.iter().flat_map(|tracks| &tracks.camera()[..moments]);
+            let rows = poses.flat_map(matrix).collect();
+            let shape = IxDyn(&[all.len(), moments, 4, 4]);
+            found.set_item("camera", owned(py, shape, rows)?)?;
+        }
+        let moments = least(|tracks| tracks.gaze().len());
+        if moments > 0 {
+            let points = all.iter().flat_map(|tracks| &tracks.gaze()[..moments]);
+            let rows = points.flatten().copied().collect();
+            let shape = IxDyn(&[all.len(), moments, 2]);
+            found.set_item("gaze", owned::<f32>(py, shape, rows)?)?;
+        }
+        type Motion = fn(&Tracks) -> &[Joints];
+        let motions: [(&str, Motion); 3] = [
+            ("body", Tracks::body),
+            ("left_hand", Tracks::left_hand),
+            ("right_hand", Tracks::right_hand),
+        ];
+        for (name, of) in motions {
+            let moments = all.iter().map(|tracks| of(tracks).len()).min().unwrap_or(0);
+            if moments > 0 {
+                let poses = all.iter().flat_map(|tracks| &of(tracks)[..moments]);
+                let rows = poses.flatten().flatten().copied().collect();
+                let shape = IxDyn(&[all.len(), moments, JOINTS, 3]);
+                found.set_item(name, owned::<f32>(py, shape, rows)?)?;
+            }
+        }
+        Ok(found)
+    }
+
+    /// How far samples are from their mean, by modality `[T, points]`.
+    fn spread<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let found = PyDict::new(py);
+        for (name, values) in self.made.spread() {
+            let shape = IxDyn(values.shape());
+            let values = values.into_iter().collect();
+            found.set_item(name, owned::<f32>(py, shape, values)?)?;
+        }
+        Ok(found)
+    }
+
     /// Hz of everything that moves.
     #[getter]
     fn rate(&self) -> f64 {
@@ -158,6 +205,12 @@ impl Reconstruction {
     }
 }
 
+/// Row by row.
+fn matrix(pose: &Rigid) -> impl Iterator<Item = f64> + use<> {
+    let matrix = pose.to_homogeneous();
+    (0..16).map(move |k| matrix[(k / 4, k % 4)])
+}
+
 /// Reconstructs a video.
 #[pyfunction]
 pub fn reconstruct(
@@ -173,6 +226,7 @@ pub fn reconstruct(
     field_of_view: Option<f64>,
     anchor: Option<PathBuf>,
     seed: u64,
+    samples: usize,
     progress: Option<Py<PyAny>>,
 ) -> PyResult<Reconstruction> {
     let mut camera = LensSettings::default();
@@ -190,6 +244,7 @@ pub fn reconstruct(
         camera,
         anchor: anchor.map(Anchor::Maps),
         seed,
+        samples,
         ..ReconstructOptions::default()
     };
     let mut heard = Progress::new(progress);

@@ -69,6 +69,43 @@ def place(tmp_path_factory):
     return folder
 
 
+DEEP = """
+experiment: deep
+about: As tiny, with depth.
+seed: 0
+stages:
+  clips: {op: clips, source: world_small, train: 4, validation: 2, test: 2}
+  tok_camera: {op: train_tokenizer, clips: clips, modality: camera, tokenizer: vq_temporal_small, steps: 2, batch: 2, warmup: {steps: 0}}
+  tok_depth: {op: train_tokenizer, clips: clips, modality: depth, tokenizer: {use: video_tiny, channels: 4}, steps: 2, batch: 2, warmup: {steps: 0}}
+  tokens: {op: tokenize, clips: clips, tokenizers: [tok_camera, tok_depth], pixels: rgb}
+  mget:
+    op: train_mget
+    tokens: [tokens]
+    size: {use: laptop_small, width: 48, heads: 2, encoder_depth: 1, decoder_depth: 1}
+    masking: {use: dirichlet, input_tokens: 32, target_tokens: 32}
+    positions: aligned
+    pixels: rgb
+    tubelet: [4, 16, 16]
+    steps: 2
+    batch: 2
+    warmup: {steps: 0}
+"""
+
+
+@pytest.fixture(scope="session")
+def deep(tmp_path_factory, video):
+    """A reconstruction with relative depth, and the same with metric depth: twice the relative, and one metre."""
+    folder = tmp_path_factory.mktemp("deep")
+    (folder / "deep.yaml").write_text(DEEP)
+    command("run", "deep.yaml", folder=folder)
+    model = reviv.load(runs=folder / "runs")
+    relative = reviv.reconstruct(video, model, seconds=2)
+    np.savez(folder / "anchor.npz", depth=2 * relative.depth.values + 1)
+    metric = reviv.reconstruct(video, model, seconds=2, anchor=folder / "anchor.npz")
+    assert not relative.depth.metric and metric.depth.metric, metric.depth.refused
+    return relative, metric
+
+
 @pytest.fixture(scope="session")
 def runs(place):
     return place / "runs"
@@ -97,7 +134,12 @@ def made(video, model):
 
 def skip_without(*modules):
     """Skips, with the reason, where a reader that others wrote is not installed."""
-    return [pytest.importorskip(name, reason=f"{name} is not installed: `pip install .[test]`") for name in modules]
+
+    def module(name):
+        reason = f"{name} is not installed here: `pip install '.[test]'`"
+        return pytest.importorskip(name, reason=reason, exc_type=ImportError)
+
+    return [module(name) for name in modules]
 
 
 @pytest.fixture

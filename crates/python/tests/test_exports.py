@@ -106,10 +106,9 @@ def test_nerfstudio_has_pictures_and_cameras_that_see_what_ours_see(place, video
     command("reconstruct", video, "-o", out, folder=place)
 
 
-def test_points_open_as_a_cloud(folder):
-    """This model has no depth: then there is no cloud, and the manifest does not name one."""
+def test_without_depth_there_is_no_cloud_and_the_manifest_names_none(folder):
     manifest = json.loads((folder / "manifest.json").read_text())
-    assert ("points.ply" in manifest["files"]) == (folder / "points.ply").is_file()
+    assert "points.ply" not in manifest["files"] and not (folder / "points.ply").exists()
 
 
 def test_every_array_that_the_manifest_names_is_there_with_its_shape(folder):

@@ -158,3 +158,41 @@ def test_errors_have_the_words_of_the_command_line(video, model, runs, change, w
 def test_a_folder_that_is_none_is_refused_with_a_way_out(tmp_path):
     with pytest.raises(reviv.Error, match="no reconstruction.*\nhint: give the folder"):
         reviv.open(tmp_path)
+
+
+def test_samples_are_the_same_from_memory_and_from_a_folder_and_leave_the_reconstruction_alone(video, model, tmp_path):
+    made = reviv.reconstruct(video, model, seconds=2, samples=3)
+    assert made.samples["body"].shape == (3, 60, 21, 3) and made.spread["body"].shape == (60, 21)
+    assert made.samples["camera"].shape == (3, 60, 4, 4) and made.samples["gaze"].shape == (3, 60, 2)
+    middle = made.samples["body"].astype(np.float64).mean(axis=0)
+    around = np.linalg.norm(made.samples["body"] - middle, axis=-1)
+    assert np.allclose(made.spread["body"], np.sqrt((around**2).mean(axis=0)), atol=1e-4)
+    made.write(tmp_path / "out")
+    again = reviv.open(tmp_path / "out")
+    assert again.camera.T_world_camera.shape == (60, 4, 4)
+    assert np.array_equal(again.body.positions, made.body.positions, equal_nan=True)
+    assert again.modalities == made.modalities and not again.signals
+    for kept, fresh in ((again.samples, made.samples), (again.spread, made.spread)):
+        assert kept.keys() == fresh.keys()
+        assert all(np.array_equal(kept[name], fresh[name], equal_nan=True) for name in kept)
+    assert not reviv.reconstruct(video, model, seconds=2).samples
+
+
+def test_pictures_are_those_of_the_page(made, folder):
+    assert len(made.pictures) == 28 and made.pictures.rate == 8 and "28 pictures at 8 Hz" in repr(made.pictures)
+    assert made.pictures.jpegs == reviv.open(folder).pictures.jpegs
+    strip = made.pictures._repr_html_()
+    assert strip.count("<img") == 8 and 'title="0.00 s"' in strip and 'title="3.38 s"' in strip
+
+
+def test_every_error_has_a_way_out_or_says_that_it_has_none(made, model, tmp_path):
+    with pytest.raises(reviv.Absent) as absent:
+        made.depth
+    assert absent.value.help == "there is camera, gaze, left_hand, body"
+    with pytest.raises(reviv.Error) as error:
+        reviv.open(tmp_path)
+    assert error.value.help.startswith("give the folder")
+    with pytest.raises(reviv.Error) as error:
+        model.vocabulary("smell")
+    assert error.value.help.startswith("it has: ")
+    assert reviv.Stopped("").help == ""

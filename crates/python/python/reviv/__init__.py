@@ -11,18 +11,10 @@
 """
 
 from ._clips import Batch, Clip, Clips, Tokens, clips, tokens, world
+from ._error import Absent
 from ._model import Model, Table, compare, evaluate, load
-from ._reconstruction import (
-    Absent,
-    CameraPath,
-    Depth,
-    Gaze,
-    Joints,
-    Reconstruction,
-    Signal,
-    open,
-    reconstruct,
-)
+from ._parts import CameraPath, Depth, Gaze, Joints, Pictures, Signal
+from ._reconstruction import Reconstruction, open, reconstruct
 from ._reviv import Error, Stopped, version as _version
 
 __version__ = _version()
@@ -38,6 +30,7 @@ __all__ = [
     "Gaze",
     "Joints",
     "Model",
+    "Pictures",
     "Reconstruction",
     "Signal",
     "Stopped",

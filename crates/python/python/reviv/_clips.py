@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from typing import Any, Iterator, Mapping, Sequence
+from typing import Any, Iterator, Mapping, Sequence, overload
 
 import numpy as np
 
 from . import _reviv
+from ._error import refused
 
 
 class Clip(Mapping[str, np.ndarray]):
@@ -43,7 +44,8 @@ class Clip(Mapping[str, np.ndarray]):
         return self._held[modality]
 
     def __getitem__(self, modality: str) -> np.ndarray:
-        return self.arrays(modality)["values"]
+        values: np.ndarray = self.arrays(modality)["values"]
+        return values
 
     def valid(self, modality: str) -> np.ndarray | None:
         """Which values are known; None for all."""
@@ -81,7 +83,11 @@ class Clips(Sequence[Clip]):
     def __len__(self) -> int:
         return len(self._native)
 
-    def __getitem__(self, index: Any) -> Any:
+    @overload
+    def __getitem__(self, index: int) -> Clip: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[Clip]: ...
+    def __getitem__(self, index: int | slice) -> Clip | list[Clip]:
         if isinstance(index, slice):
             return [self[at] for at in range(*index.indices(len(self)))]
         at = index + len(self) if index < 0 else index
@@ -89,7 +95,7 @@ class Clips(Sequence[Clip]):
             raise IndexError(f"clip {index} of {len(self)}")
         made = self._native.clip(at, self._modalities)
         if made is None:
-            raise _reviv.Error(f"the recording does not allow clip {index}; iteration leaves such clips out")
+            raise refused(f"the recording does not allow clip {index}", "iteration leaves such clips out")
         return Clip(made)
 
     def __iter__(self) -> Iterator[Clip]:
@@ -167,7 +173,7 @@ class Tokens:
         known = native.modalities
         for name in modalities or []:
             if name not in known:
-                raise _reviv.Error(f"no tokens of `{name}` in `{native.place}`\nhint: there is {', '.join(known)}")
+                raise refused(f"no tokens of `{name}` in `{native.place}`", f"there is {', '.join(known)}")
         self.modalities: tuple[str, ...] = tuple(modalities or known)
 
     def __len__(self) -> int:

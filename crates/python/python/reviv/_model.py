@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from . import _reviv
+from ._error import refused
 from ._progress import Progress, callback
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ class Model:
         """How many different tokens a modality has."""
         found = self._native.vocabulary(modality)
         if found is None:
-            raise _reviv.Error(f"no modality `{modality}` in this model; it has: {', '.join(self.modalities)}")
+            raise refused(f"no modality `{modality}` in this model", f"it has: {', '.join(self.modalities)}")
         return found
 
     def encode(self, clip: Clip) -> dict[str, np.ndarray]:

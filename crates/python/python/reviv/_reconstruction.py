@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import base64
 import csv
 import html
 import json
 import os
+import re
 import shutil
 from functools import cached_property
 from pathlib import Path
@@ -14,17 +16,14 @@ from typing import Any, Iterator, Mapping, Protocol
 import numpy as np
 
 from . import _reviv
+from ._error import Absent, refused
 from ._model import Model, load
+from ._parts import CameraPath, Depth, Gaze, Joints, Pictures, Signal, scale_words
 from ._progress import Progress, callback
 
-_WORLD = "world: z up, metres, origin and heading of the first camera"
-_CAMERA = "camera of the same sample: x right, y down, z forward, metres"
-_IMAGE = "upright square image"
 _CONFIDENCE = "confidence.npz"
-
-
-class Absent(_reviv.Error, AttributeError):
-    """What was asked for is not part of this reconstruction."""
+#: Holds arrays with the names of those of the reconstruction itself.
+_SAMPLES = "samples.npz"
 
 
 class _Source(Protocol):
@@ -39,6 +38,8 @@ class _Source(Protocol):
     def depth(self) -> tuple[np.ndarray, float] | None: ...
     def confidence(self) -> dict[str, np.ndarray]: ...
     def signals(self) -> dict[str, tuple[np.ndarray, float, list[str], list[str]]]: ...
+    def samples(self) -> dict[str, np.ndarray]: ...
+    def spread(self) -> dict[str, np.ndarray]: ...
     def page(self) -> str: ...
     def write(self, folder: str) -> None: ...
 
@@ -53,12 +54,14 @@ class _Folder:
         try:
             self._manifest: dict[str, Any] = json.loads((path / "manifest.json").read_text("utf-8"))
             entries = self._manifest["arrays"]
-            # Confidence is named after what it is of.
-            self._arrays = {entry["name"]: entry for entry in entries if entry["file"] != _CONFIDENCE}
+            # Confidence and samples are named after what they are of.
+            self._arrays = {
+                entry["name"]: entry for entry in entries if entry["file"] not in (_CONFIDENCE, _SAMPLES)
+            }
         except (OSError, ValueError, KeyError, TypeError) as error:
-            raise _reviv.Error(
-                f"{path}: no reconstruction: {error}\n"
-                "hint: give the folder that `reviv reconstruct` made, with its `manifest.json`"
+            raise refused(
+                f"{path}: no reconstruction: {error}",
+                "give the folder that `reviv reconstruct` made, with its `manifest.json`",
             ) from error
 
     def _read(self, name: str) -> np.ndarray | None:
@@ -71,7 +74,7 @@ class _Folder:
             with np.load(path, allow_pickle=False) as arrays:
                 array = arrays[name] if name in arrays.files else None
         except (OSError, ValueError) as error:
-            raise _reviv.Error(f"{path}: {error}") from error
+            raise refused(f"{path}: {error}", "reconstruct it again") from error
         if array is not None:
             array.flags.writeable = False
         return array
@@ -113,8 +116,8 @@ class _Folder:
         return found
 
     def signals(self) -> dict[str, tuple[np.ndarray, float, list[str], list[str]]]:
-        own = {"body.npz", "hands.npz", "camera.npz", "gaze.npz", "depth.npz", _CONFIDENCE}
-        found = {}
+        own = {"body.npz", "hands.npz", "camera.npz", "gaze.npz", "depth.npz", _CONFIDENCE, _SAMPLES}
+        found: dict[str, tuple[np.ndarray, float, list[str], list[str]]] = {}
         for entry in self._manifest["arrays"]:
             name = entry["name"]
             if entry["file"] in own or name.endswith("_valid"):
@@ -124,8 +127,24 @@ class _Folder:
                 found[name] = (values, float(entry["rate"]), [], entry["unit"].split())
         return found
 
+    def _of_samples(self) -> dict[str, np.ndarray]:
+        names = [entry["name"] for entry in self._manifest["arrays"] if entry["file"] == _SAMPLES]
+        found = {name: self._of(_SAMPLES, name) for name in names}
+        return {name.replace("T_world_camera", "camera"): a for name, a in found.items() if a is not None}
+
+    def samples(self) -> dict[str, np.ndarray]:
+        return {name: array for name, array in self._of_samples().items() if not name.endswith("_spread")}
+
+    def spread(self) -> dict[str, np.ndarray]:
+        found = self._of_samples().items()
+        return {name.removesuffix("_spread"): array for name, array in found if name.endswith("_spread")}
+
     def page(self) -> str:
-        return (self.path / "view.html").read_text("utf-8")
+        path = self.path / "view.html"
+        try:
+            return path.read_text("utf-8")
+        except (OSError, ValueError) as error:
+            raise refused(f"{path}: {error}", "reconstruct it again") from error
 
     def write(self, folder: str) -> None:
         target = Path(folder)
@@ -136,178 +155,6 @@ class _Folder:
 
 def _names(names: tuple[str, ...]) -> str:
     return ", ".join(names) if names else "nothing"
-
-
-class Joints:
-    """21 named joints over time: the body in the world, or a hand in the camera of the same sample."""
-
-    def __init__(self, modality: str, positions: np.ndarray, rate: float, confidence: np.ndarray | None) -> None:
-        names, parents = _reviv.skeleton(modality)
-        self.modality = modality
-        #: ``[samples, 21, 3]``, metres, read-only; NaN where unknown.
-        self.positions: np.ndarray = positions
-        #: The joints' names, in the order of ``positions``.
-        self.names: tuple[str, ...] = tuple(names)
-        #: Per joint the one nearer to the root; the root is its own parent.
-        self.parents: tuple[int, ...] = tuple(parents)
-        #: Samples per second.
-        self.rate: float = rate
-        #: The frame of reference, in words.
-        self.frame: str = _WORLD if modality == "body" else _CAMERA
-        #: ``[samples]``, 0 (a guess) to 1 (certain), by the entropy of the tokens. Not an accuracy.
-        self.confidence: np.ndarray | None = confidence
-
-    @property
-    def valid(self) -> np.ndarray:
-        """``[samples, 21]``: which joints are known."""
-        return np.isfinite(self.positions).all(axis=-1)
-
-    def position(self, joint: str, seconds: float) -> np.ndarray:
-        """Where a joint is, ``[3]`` metres: linear between the samples around ``seconds``."""
-        if joint not in self.names:
-            raise _reviv.Error(f"no joint `{joint}`\nhint: {', '.join(self.names)}")
-        length = len(self.positions) / self.rate
-        if not 0 <= seconds <= length:
-            raise _reviv.Error(f"{seconds} s lies outside the recording of {length} s")
-        track = self.positions[:, self.names.index(joint)]
-        at = min(seconds * self.rate, len(track) - 1)
-        before = int(at)
-        after, share = min(before + 1, len(track) - 1), at - before
-        # An unknown neighbour does not matter exactly at a sample.
-        return track[before].copy() if share == 0 else (1 - share) * track[before] + share * track[after]
-
-    def __len__(self) -> int:
-        return len(self.positions)
-
-    def __repr__(self) -> str:
-        known = 100 * float(self.valid.mean()) if len(self) else 0.0
-        return (
-            f"<{self.modality}: {len(self)} samples of {len(self.names)} joints at {self.rate:g} Hz, "
-            f"{known:.0f} % known, in the {self.frame}>"
-        )
-
-
-class CameraPath:
-    """The head camera over time."""
-
-    def __init__(self, poses: np.ndarray, rate: float, intrinsics: Mapping[str, float]) -> None:
-        #: ``[samples, 4, 4]``: camera to world, metres; the camera looks along z, x right, y down.
-        self.T_world_camera: np.ndarray = poses
-        #: Samples per second.
-        self.rate: float = rate
-        #: The frame of reference, in words.
-        self.frame: str = _WORLD
-        #: Width and height of the square frames that the model saw, pixels.
-        self.size: tuple[int, int] = (int(intrinsics["width"]), int(intrinsics["height"]))
-        #: ``[3, 3]`` pinhole intrinsics of those frames; the centre of the top left pixel is (0, 0).
-        self.K: np.ndarray = np.array(
-            [[intrinsics["fx"], 0, intrinsics["cx"]], [0, intrinsics["fy"], intrinsics["cy"]], [0, 0, 1]],
-            dtype=np.float64,
-        )
-
-    @property
-    def positions(self) -> np.ndarray:
-        """``[samples, 3]``: where it is in the world, metres."""
-        return self.T_world_camera[:, :3, 3]
-
-    def __len__(self) -> int:
-        return len(self.T_world_camera)
-
-    def __repr__(self) -> str:
-        steps = np.linalg.norm(np.diff(self.positions, axis=0), axis=1)
-        return f"<camera: {len(self)} samples at {self.rate:g} Hz, a path of {steps.sum():.2f} m>"
-
-
-class Gaze:
-    """Where the wearer looks."""
-
-    def __init__(self, points: np.ndarray, rate: float, size: tuple[int, int], confidence: np.ndarray | None) -> None:
-        #: ``[samples, 2]``: x right and y down as shares of the upright square image; NaN where unknown.
-        self.points: np.ndarray = points
-        #: Samples per second.
-        self.rate: float = rate
-        #: The frame of reference, in words.
-        self.frame: str = _IMAGE
-        #: Width and height of the square frames that the model saw, pixels.
-        self.size: tuple[int, int] = size
-        #: ``[samples]``, 0 (a guess) to 1 (certain). Not an accuracy.
-        self.confidence: np.ndarray | None = confidence
-
-    @property
-    def pixels(self) -> np.ndarray:
-        """``[samples, 2]``: in pixels of the square frames; the centre of the top left pixel is (0, 0)."""
-        return self.points * np.array(self.size, dtype=self.points.dtype) - self.points.dtype.type(0.5)
-
-    @property
-    def valid(self) -> np.ndarray:
-        """``[samples]``: where it is known."""
-        return np.isfinite(self.points).all(axis=-1)
-
-    def __len__(self) -> int:
-        return len(self.points)
-
-    def __repr__(self) -> str:
-        return f"<gaze: {len(self)} samples at {self.rate:g} Hz in the {self.frame}>"
-
-
-class Depth:
-    """Depth along the optical axis over the square image, one map per frame of the model's video."""
-
-    def __init__(self, values: np.ndarray, rate: float, manifest: Mapping[str, Any]) -> None:
-        #: ``[frames, height, width]``: metres where ``metric``, else of unknown scale and shift.
-        self.values: np.ndarray = values
-        #: Frames per second.
-        self.rate: float = rate
-        #: Whether ``values`` are metres, and by what: ``metric by floor fit``, ``relative``.
-        self.scale: str = _scale(manifest["scale"])
-        #: Whether ``values`` are metres.
-        self.metric: bool = manifest.get("fit") is not None
-        #: The fit that made depth metric.
-        self.fit: dict[str, float] | None = manifest.get("fit")
-        #: Why depth stayed relative.
-        self.refused: str | None = manifest.get("refused")
-
-    @property
-    def metres(self) -> np.ndarray:
-        """``[frames, height, width]`` metres; refused where depth is relative."""
-        if not self.metric:
-            raise Absent(
-                f"depth is relative: {self.refused}\nhint: `values` has it up to scale and shift; `anchor=` gives it a scale"
-            )
-        return self.values
-
-    def __len__(self) -> int:
-        return len(self.values)
-
-    def __repr__(self) -> str:
-        frames, height, width = self.values.shape
-        return f"<depth: {frames} maps of {height} x {width} at {self.rate:g} Hz, {self.scale}>"
-
-
-class Signal:
-    """A modality without a type of its own: channels over time."""
-
-    def __init__(self, name: str, values: np.ndarray, rate: float, channels: list[str], units: list[str]) -> None:
-        self.name = name
-        #: ``[samples, channels]``; NaN where unknown.
-        self.values: np.ndarray = values
-        #: Samples per second.
-        self.rate: float = rate
-        #: The channels' names, where they are known.
-        self.channels: tuple[str, ...] = tuple(channels)
-        #: One unit per channel, or one for all.
-        self.units: tuple[str, ...] = tuple(units)
-
-    def __repr__(self) -> str:
-        samples, channels = self.values.shape
-        return f"<{self.name}: {samples} samples of {channels} channels at {self.rate:g} Hz>"
-
-
-def _scale(status: Any) -> str:
-    if isinstance(status, Mapping):
-        inner = status.get("metric", status)
-        return f"metric by {inner['by']}" if isinstance(inner, Mapping) and "by" in inner else str(status)
-    return "no length" if status == "none" else str(status)
 
 
 class Reconstruction:
@@ -333,6 +180,11 @@ class Reconstruction:
         return float(self.manifest["seconds"])
 
     @property
+    def rate(self) -> float:
+        """Samples per second of camera, gaze, hands, body and confidence."""
+        return self._source.rate
+
+    @property
     def assumptions(self) -> dict[str, str]:
         """What was assumed, and where it came from."""
         return {label: value for label, value in self.manifest["assumptions"]}
@@ -349,7 +201,7 @@ class Reconstruction:
         return Joints(modality, positions, self._source.rate, self.confidence.get(modality))
 
     def _absent(self, modality: str) -> Absent:
-        return Absent(f"`{modality}` was not reconstructed\nhint: there is {_names(self.modalities)}")
+        return refused(f"`{modality}` was not reconstructed", f"there is {_names(self.modalities)}", Absent)
 
     @cached_property
     def body(self) -> Joints:
@@ -393,6 +245,28 @@ class Reconstruction:
         return Depth(*found, self.manifest)
 
     @cached_property
+    def pictures(self) -> Pictures:
+        """The square frames that the model saw, as its page has them."""
+        page = self.page()
+        about = re.search(r'<script type="application/json" id="manifest">(.*?)</script>', page, re.DOTALL)
+        video = json.loads(about[1])["video"] if about else None
+        held = re.search(r'<script type="text/plain" id="blob-video">(.*?)</script>', page, re.DOTALL)
+        if not video or not held:
+            return Pictures((), 1.0)
+        blob, ends = base64.b64decode(held[1]), video["offsets"]
+        return Pictures(tuple(blob[a:b] for a, b in zip(ends, ends[1:])), float(video["rate"]))
+
+    @cached_property
+    def samples(self) -> dict[str, np.ndarray]:
+        """Every sample by modality, ``[samples, ...]`` and then as in the reconstruction; empty unless asked for (``samples=8``)."""
+        return self._source.samples()
+
+    @cached_property
+    def spread(self) -> dict[str, np.ndarray]:
+        """How far the samples are from their mean, by modality: ``[T, 1]`` or ``[T, 21]``, metres (gaze: shares of the image)."""
+        return self._source.spread()
+
+    @cached_property
     def signals(self) -> dict[str, Signal]:
         """Every other modality, by name."""
         return {name: Signal(name, *parts) for name, parts in self._source.signals().items()}
@@ -401,14 +275,9 @@ class Reconstruction:
     def modalities(self) -> tuple[str, ...]:
         """What was reconstructed."""
         source = self._source
-        built_in = {
-            "camera": lambda: source.camera(),
-            "gaze": lambda: source.gaze(),
-            "left_hand": lambda: source.joints("left_hand"),
-            "right_hand": lambda: source.joints("right_hand"),
-            "body": lambda: source.joints("body"),
-        }
-        found = [name for name, read in built_in.items() if read() is not None]
+        built_in = [("camera", source.camera()), ("gaze", source.gaze())]
+        built_in += [(name, source.joints(name)) for name in ("left_hand", "right_hand", "body")]
+        found = [name for name, values in built_in if values is not None]
         if self.manifest["scale"] not in (None, "none"):
             found.append("depth")
         return (*found, *self.signals)
@@ -429,11 +298,20 @@ class Reconstruction:
         self._source.write(os.fspath(path))
         return path / "view.html"
 
+    def to_rerun(self, path: str | os.PathLike[str]) -> Path:
+        """Writes an ``.rrd`` for `Rerun <https://rerun.io>`_, which ``rerun FILE`` opens; needs ``pip install rerun-sdk``.
+
+        :mod:`reviv.rerun` says what is in it, and sends the same to a viewer that is open.
+        """
+        from .rerun import write
+
+        return write(self, path)
+
     def __repr__(self) -> str:
         lines = [f"<reconstruction of `{self.title}`, {self.seconds:.2f} s: {_names(self.modalities)}"]
         lines += [f"  {label}: {value}" for label, value in self.assumptions.items()]
         if "depth" in self:
-            lines.append(f"  Depth: {_scale(self.manifest['scale'])}")
+            lines.append(f"  Depth: {scale_words(self.manifest['scale'])}")
         return "\n".join(lines) + ">"
 
     def _repr_html_(self) -> str:
@@ -458,6 +336,7 @@ def reconstruct(
     fov: float | None = None,
     anchor: str | os.PathLike[str] | None = None,
     seed: int = 0,
+    samples: int = 1,
     progress: Progress = None,
     runs: str | os.PathLike[str] = "runs",
 ) -> Reconstruction:
@@ -465,7 +344,8 @@ def reconstruct(
 
     ``model`` is a :class:`Model`, a model folder, or a run that trained one; without it, the model of the latest run in ``runs``.
     ``decoding`` names how tokens are generated (``fast``, ``paper``, ...), ``fov`` is the horizontal field of view of the centre
-    square in degrees, ``anchor`` metric depth of another model to take the scale from. ``progress`` is True for a bar, or a callable
+    square in degrees, ``anchor`` metric depth of another model to take the scale from. ``samples`` above one gives as many beside
+    the reconstruction, with their spread. ``progress`` is True for a bar, or a callable
     that hears ``(done, total, "windows")`` and stops the work by returning False.
 
     Raises :class:`Error` with the words of the command line, and :class:`Stopped` where the callback stopped it.
@@ -483,6 +363,7 @@ def reconstruct(
         fov,
         None if anchor is None else os.fspath(anchor),
         seed,
+        samples,
         callback(progress),
     )
     return Reconstruction(made)
