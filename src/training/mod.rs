@@ -43,7 +43,7 @@ pub use optimizer::{AdamW, AdamWSettings};
 pub use sampler::Sampler;
 pub use schedule::Schedule;
 pub use settings::{DatasetSize, Duration, Keep, TrainingSettings};
-pub use shards::Shards;
+pub use shards::TokenShards;
 pub use source::{DataError, InMemory, TokenSample, TokenSource};
 pub use tokenizer_fit::{FittedTokenizer, TokenizerFit, TokenizerOptions};
 pub use trainer::checkpoint::{Checkpoint, Snapshot};

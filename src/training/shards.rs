@@ -7,14 +7,13 @@
 //! nothing is unpacked, and every read goes to the shard again, so one that vanishes is noticed.
 
 use super::source::{DataError, TokenSample, TokenSource};
-use crate::formats::npy;
 use crate::formats::npz::Npz;
-use crate::formats::{TAR_CUT, tar_has_end};
+use crate::formats::tar::{self, Header, Member};
+use crate::formats::{FormatError, npy};
 use crate::mget::MgetSpec;
 use crate::tokenizer::TokenGrid;
 use std::collections::BTreeMap;
 use std::fs::File;
-use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
 /// The largest member that is read: a raw clip of 32 frames of 512 x 512 has 25 MB.
@@ -22,20 +21,19 @@ const MAX_MEMBER: u64 = 256 << 20;
 
 /// Token shards of one data set and split.
 #[derive(Debug)]
-pub struct Shards {
+pub struct TokenShards {
     name: String,
     /// Per modality of the model: its name, the shape of its values of a clip, and its vocabulary (none for raw video).
     modalities: Vec<(String, Vec<usize>, Option<usize>)>,
     paths: Vec<PathBuf>,
     /// In order of names; per modality where the member lies.
-    clips: Vec<(String, Vec<Option<Member>>)>,
+    clips: Vec<(String, Vec<Option<Place>>)>,
 }
 
 #[derive(Debug, Clone, Copy)]
-struct Member {
+struct Place {
     shard: u32,
-    offset: u64,
-    length: u64,
+    member: Member,
     zipped: bool,
 }
 
@@ -46,7 +44,7 @@ fn shard_error(path: &Path, reason: &dyn std::fmt::Display) -> DataError {
     }
 }
 
-impl Shards {
+impl TokenShards {
     /// The shards below `folder`, one sub-folder per modality of `spec`.
     ///
     /// # Errors
@@ -58,7 +56,7 @@ impl Shards {
             paths: Vec::new(),
             clips: Vec::new(),
         };
-        let mut members: BTreeMap<String, Vec<Option<Member>>> = BTreeMap::new();
+        let mut members: BTreeMap<String, Vec<Option<Place>>> = BTreeMap::new();
         for (index, modality) in spec.modalities.iter().enumerate() {
             let shape = match modality.input {
                 crate::mget::Input::Tokens { ref grid, .. } => grid.clone(),
@@ -71,21 +69,25 @@ impl Shards {
                 let shard = shards.paths.len() as u32;
                 let found = directory(&path)?;
                 shards.paths.push(path);
-                for (stem, mut member) in found {
-                    member.shard = shard;
+                for (stem, zipped, member) in found {
+                    let place = Place {
+                        shard,
+                        member,
+                        zipped,
+                    };
                     let entry = members
                         .entry(stem.clone())
                         .or_insert_with(|| vec![None; spec.modalities.len()]);
-                    if let Some(first) = entry[index].replace(member) {
-                        let path = |member: Member| {
-                            let path = &shards.paths[member.shard as usize];
+                    if let Some(first) = entry[index].replace(place) {
+                        let path = |place: Place| {
+                            let path = &shards.paths[place.shard as usize];
                             path.display().to_string()
                         };
                         return Err(DataError::Twice {
                             modality: modality.name.clone(),
                             clip: stem,
                             first: path(first),
-                            second: path(member),
+                            second: path(place),
                         });
                     }
                 }
@@ -95,15 +97,9 @@ impl Shards {
         Ok(shards)
     }
 
-    fn bytes(&self, member: Member) -> Result<Vec<u8>, DataError> {
-        let path = &self.paths[member.shard as usize];
-        let read = || -> std::io::Result<Vec<u8>> {
-            let mut file = File::open(path)?;
-            file.seek(SeekFrom::Start(member.offset))?;
-            let mut bytes = vec![0; member.length as usize];
-            file.read_exact(&mut bytes)?;
-            Ok(bytes)
-        };
+    fn bytes(&self, place: Place) -> Result<Vec<u8>, DataError> {
+        let path = &self.paths[place.shard as usize];
+        let read = || place.member.read(&mut File::open(path)?);
         read().map_err(|error| shard_error(path, &error))
     }
 }
@@ -113,39 +109,25 @@ const DEPTH: usize = 3;
 
 /// The shards of one modality in order of names; none when the folder does not exist.
 fn tars(folder: &Path) -> Result<Vec<PathBuf>, DataError> {
-    let mut paths = Vec::new();
     if folder.is_dir() {
-        collect(folder, DEPTH, &mut paths)?;
+        tar::below(folder, DEPTH).map_err(|error| refused(folder, error))
+    } else {
+        Ok(Vec::new())
     }
-    paths.sort();
-    Ok(paths)
 }
 
-fn collect(folder: &Path, depth: usize, into: &mut Vec<PathBuf>) -> Result<(), DataError> {
-    let refuse = |error: std::io::Error| shard_error(folder, &error);
-    for entry in std::fs::read_dir(folder).map_err(refuse)? {
-        let path = entry.map_err(refuse)?.path();
-        if path.is_dir() && depth > 0 {
-            collect(&path, depth - 1, into)?;
-        } else if path.extension().is_some_and(|extension| extension == "tar") {
-            into.push(path);
-        }
+fn refused(path: &Path, error: FormatError) -> DataError {
+    match error {
+        FormatError::File { path, source } => shard_error(&path, &source),
+        error => shard_error(path, &error),
     }
-    Ok(())
 }
 
-/// The members of a shard by stem.
-fn directory(path: &Path) -> Result<Vec<(String, Member)>, DataError> {
-    let refuse = |error: std::io::Error| shard_error(path, &error);
-    let file = File::open(path).map_err(refuse)?;
-    let length = file.metadata().map_err(refuse)?.len();
-    let mut archive = tar::Archive::new(std::io::BufReader::new(file));
+/// The members of a shard by stem, and whether they are zipped.
+fn directory(path: &Path) -> Result<Vec<(String, bool, Member)>, DataError> {
     let mut members = Vec::new();
-    let mut end: u64 = 0;
-    for entry in archive.entries_with_seek().map_err(refuse)? {
-        let entry = entry.map_err(refuse)?;
-        end = entry.raw_file_position().saturating_add(entry.size());
-        let name = entry.path().map_err(refuse)?.to_string_lossy().into_owned();
+    for Header { name, member, .. } in tar::headers(path).map_err(|error| refused(path, error))? {
+        let name = String::from_utf8_lossy(&name);
         let Some((stem, zipped)) = name
             .strip_suffix(".npy")
             .map(|stem| (stem, false))
@@ -153,30 +135,16 @@ fn directory(path: &Path) -> Result<Vec<(String, Member)>, DataError> {
         else {
             continue;
         };
-        let member = Member {
-            shard: 0,
-            offset: entry.raw_file_position(),
-            length: entry.size(),
-            zipped,
-        };
-        if member.length > MAX_MEMBER || member.offset.saturating_add(member.length) > length {
-            return Err(shard_error(
-                path,
-                &format!(
-                    "member {name} of {} bytes does not fit the file",
-                    member.length
-                ),
-            ));
+        if member.size > MAX_MEMBER {
+            let reason = format!("member {name} of {} bytes is too large", member.size);
+            return Err(shard_error(path, &reason));
         }
-        members.push((stem.to_owned(), member));
-    }
-    if !tar_has_end(length, end) {
-        return Err(shard_error(path, &format!("byte {end}: {TAR_CUT}")));
+        members.push((stem.to_owned(), zipped, member));
     }
     Ok(members)
 }
 
-impl TokenSource for Shards {
+impl TokenSource for TokenShards {
     fn name(&self) -> &str {
         &self.name
     }
@@ -192,15 +160,15 @@ impl TokenSource for Shards {
             ..TokenSample::default()
         };
         for ((name, shape, vocabulary), member) in self.modalities.iter().zip(members) {
-            let Some(member) = *member else { continue };
-            let path = &self.paths[member.shard as usize];
+            let Some(place) = *member else { continue };
+            let path = &self.paths[place.shard as usize];
             let shard = path.display().to_string();
             sample.shards.insert(name.clone(), shard);
-            let bytes = self.bytes(member)?;
+            let bytes = self.bytes(place)?;
             let refuse = |error: &dyn std::fmt::Display| {
                 shard_error(path, &format!("{key}, {name}: {error}"))
             };
-            let array = if member.zipped {
+            let array = if place.zipped {
                 let arrays = Npz::parse(&bytes).map_err(|error| refuse(&error))?.arrays;
                 let first = arrays.into_values().next();
                 first.ok_or_else(|| refuse(&"an empty archive"))?
@@ -234,11 +202,11 @@ mod tests {
     fn write(folder: &Path, modality: &str, members: &[(&str, Vec<i64>)]) {
         let folder = folder.join(modality);
         std::fs::create_dir_all(&folder).unwrap();
-        let mut tar = tar::Builder::new(File::create(folder.join("shard-000000.tar")).unwrap());
+        let mut tar = ::tar::Builder::new(File::create(folder.join("shard-000000.tar")).unwrap());
         for (key, ids) in members {
             let array = ArrayD::from_shape_vec(vec![ids.len()], ids.clone()).unwrap();
             let bytes = npy::to_bytes(&npy::NpyArray::from(&array));
-            let mut header = tar::Header::new_gnu();
+            let mut header = ::tar::Header::new_gnu();
             header.set_size(bytes.len() as u64);
             header.set_mode(0o644);
             tar.append_data(&mut header, format!("{key}.npy"), bytes.as_slice())
@@ -271,7 +239,7 @@ mod tests {
             "left_hand",
             &[("a", vec![0, 3]), ("c", vec![4, 4])],
         );
-        let shards = Shards::open(folder.path(), "set", &spec()).unwrap();
+        let shards = TokenShards::open(folder.path(), "set", &spec()).unwrap();
         assert_eq!(shards.len(), 3);
         assert_eq!(shards.read(0).unwrap().tokens["left_hand"].ids, [0, 3]);
         assert_eq!(shards.read(1).unwrap().tokens["camera"].ids, [3, 4]);
@@ -291,11 +259,13 @@ mod tests {
         write(folder.path(), "camera/first", &[("a", vec![1, 2])]);
         write(folder.path(), "camera/second", &[("b", vec![1, 2])]);
         assert_eq!(
-            Shards::open(folder.path(), "set", &spec()).unwrap().len(),
+            TokenShards::open(folder.path(), "set", &spec())
+                .unwrap()
+                .len(),
             2
         );
         write(folder.path(), "camera/third", &[("a", vec![5, 6])]);
-        let error = Shards::open(folder.path(), "set", &spec()).unwrap_err();
+        let error = TokenShards::open(folder.path(), "set", &spec()).unwrap_err();
         let message = error.to_string();
         for part in [
             "`a`",
@@ -312,7 +282,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         write(folder.path(), "camera", &[("a", vec![1, 8])]);
         write(folder.path(), "left_hand", &[("a", vec![0, 3])]);
-        let shards = Shards::open(folder.path(), "set", &spec()).unwrap();
+        let shards = TokenShards::open(folder.path(), "set", &spec()).unwrap();
         let error = shards.read(0).unwrap().check(&spec()).unwrap_err();
         let message = error.to_string();
         assert!(message.contains("camera/shard-000000.tar"), "{message}");
@@ -332,8 +302,8 @@ mod tests {
         assert_eq!(bytes.len(), 6 * 512);
         for blocks in [0, 2, 4] {
             std::fs::write(&path, &bytes[..blocks * 512]).unwrap();
-            let error = Shards::open(folder.path(), "set", &spec()).unwrap_err();
-            assert!(error.to_string().contains(TAR_CUT), "{blocks}: {error}");
+            let error = TokenShards::open(folder.path(), "set", &spec()).unwrap_err();
+            assert!(error.to_string().contains(crate::formats::TAR_CUT), "{blocks}: {error}");
         }
     }
 
@@ -341,7 +311,7 @@ mod tests {
     fn a_shard_that_goes_away_or_is_cut_is_named() {
         let folder = tempfile::tempdir().unwrap();
         write(folder.path(), "camera", &[("a", vec![1, 2])]);
-        let shards = Shards::open(folder.path(), "set", &spec()).unwrap();
+        let shards = TokenShards::open(folder.path(), "set", &spec()).unwrap();
         let path = folder.path().join("camera/shard-000000.tar");
         let bytes = std::fs::read(&path).unwrap();
         std::fs::remove_file(&path).unwrap();
@@ -353,7 +323,7 @@ mod tests {
                 .contains("shard-000000.tar")
         );
         std::fs::write(&path, &bytes[..600]).unwrap();
-        assert!(Shards::open(folder.path(), "set", &spec()).is_err());
+        assert!(TokenShards::open(folder.path(), "set", &spec()).is_err());
         std::fs::write(&path, &bytes).unwrap();
         assert!(shards.read(0).is_ok());
     }

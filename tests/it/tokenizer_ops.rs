@@ -4,7 +4,7 @@ use crate::run_text::{failures, run_text};
 use reviv::mget::{MgetSpec, ModalitySpec, Positions, Size};
 use reviv::run::Cache;
 use reviv::run::State;
-use reviv::training::{Shards, TokenSource};
+use reviv::training::{TokenShards, TokenSource};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 
@@ -126,7 +126,7 @@ fn clips_become_tokens_that_the_model_reads_and_the_tokenizer_decodes() {
     };
     let mut hands = 0;
     for (split, clips) in [("train", 24), ("validation", 6)] {
-        let shards = Shards::open(&tokens.join(split), "tiny", &spec).unwrap();
+        let shards = TokenShards::open(&tokens.join(split), "tiny", &spec).unwrap();
         assert_eq!(shards.len(), clips);
         for index in 0..clips {
             let sample = shards.read(index).unwrap();
@@ -138,7 +138,7 @@ fn clips_become_tokens_that_the_model_reads_and_the_tokenizer_decodes() {
     }
     assert!(hands > 0, "no clip shows the left hand");
 
-    let shards = Shards::open(&tokens.join("validation"), "tiny", &spec).unwrap();
+    let shards = TokenShards::open(&tokens.join("validation"), "tiny", &spec).unwrap();
     let grid = shards.read(0).unwrap().tokens["camera"].clone();
     for place in [path.clone(), tokens.join("tokenizers/camera")] {
         let tokenizer = reviv::tokenizer::open(&place, &reviv::engine::Compute::cpu()).unwrap();

@@ -5,7 +5,7 @@ use crate::error::{of_run, refused};
 use ndarray::IxDyn;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
-use reviv::clip::shard::Shards;
+use reviv::clip::shard::ShardIndex;
 use reviv::clip::source::{ClipSource, Outcome};
 use reviv::clip::store::ClipSet;
 use reviv::formats::npy::{self, NpyArray};
@@ -188,7 +188,7 @@ impl Clip {
 /// Tokens in shards.
 #[pyclass(frozen, module = "reviv._reviv")]
 pub struct Tokens {
-    shards: Shards,
+    shards: ShardIndex,
     #[pyo3(get)]
     place: String,
 }
@@ -240,7 +240,7 @@ fn member(bytes: &[u8]) -> Result<NpyArray, String> {
 #[pyfunction]
 pub fn open_tokens(py: Python<'_>, path: PathBuf, split: &str, runs: PathBuf) -> PyResult<Tokens> {
     let root = locate(py, &path, &runs, "tokens", split)?;
-    let shards = py.detach(|| Shards::open(&root));
+    let shards = py.detach(|| ShardIndex::open(&root));
     let shards = shards.map_err(|error| {
         refused(
             py,

@@ -13,8 +13,8 @@ use crate::run::environment::Stopwatch;
 use crate::run::files::copy_tree;
 use crate::training::mget_fit::held_out_table;
 use crate::training::{
-    DataError, Event, FittedMget, Flow, HeldOut, Keep, MgetFit, Shards, StepReport, TokenSource,
-    TrainingError, TrainingSettings,
+    DataError, Event, FittedMget, Flow, HeldOut, Keep, MgetFit, StepReport, TokenShards,
+    TokenSource, TrainingError, TrainingSettings,
 };
 use serde_json::{Value, json};
 use std::collections::BTreeMap;
@@ -64,7 +64,7 @@ pub(super) fn run(
         Masking::new(&settings.masking.settings, &spec.slots()).map_err(StageError::other)?;
     same_tokenizers(&spec, &artifacts)?;
     let open = |artifact: &InputArtifact, split: &str| {
-        Shards::open(&artifact.path.join(split), &artifact.stage, &spec).map_err(input_error)
+        TokenShards::open(&artifact.path.join(split), &artifact.stage, &spec).map_err(input_error)
     };
     let mut sources: Vec<Arc<dyn TokenSource>> = Vec::new();
     for artifact in &artifacts {

@@ -9,10 +9,11 @@
 //! one at a time when asked for, in any order, so memory does not grow with the data. Tars are untrusted: a size is compared
 //! with the file before anything is allocated.
 
-use crate::formats::{TAR_CUT, tar_has_end};
+use crate::formats::FormatError;
+use crate::formats::tar::{self, Member};
 use std::collections::BTreeMap;
 use std::fs::File;
-use std::io::{BufWriter, Read, Seek, SeekFrom};
+use std::io::BufWriter;
 use std::path::{Path, PathBuf};
 
 /// Samples per shard of tokens, as in the released data.
@@ -74,7 +75,7 @@ fn io(path: &Path) -> impl FnOnce(std::io::Error) -> ShardError + '_ {
 pub struct ShardWriter {
     root: PathBuf,
     number: u32,
-    open: BTreeMap<String, (PathBuf, tar::Builder<BufWriter<File>>)>,
+    open: BTreeMap<String, (PathBuf, ::tar::Builder<BufWriter<File>>)>,
 }
 
 impl ShardWriter {
@@ -107,7 +108,7 @@ impl ShardWriter {
             let path = place.join(format!("shard-{:06}.tar", self.number));
             let temporary = path.with_extension("tar.part");
             let file = File::create(&temporary).map_err(io(&temporary))?;
-            let builder = tar::Builder::new(BufWriter::with_capacity(1 << 18, file));
+            let builder = ::tar::Builder::new(BufWriter::with_capacity(1 << 18, file));
             self.open.insert(folder.to_owned(), (path, builder));
         }
         let (path, builder) = self
@@ -115,7 +116,7 @@ impl ShardWriter {
             .get_mut(folder)
             .expect("the folder's tar was opened above");
         // Nothing in the header but name and size: the same clips give the same bytes.
-        let mut header = tar::Header::new_ustar();
+        let mut header = ::tar::Header::new_ustar();
         header.set_size(bytes.len() as u64);
         header.set_mode(0o644);
         header.set_mtime(0);
@@ -146,20 +147,19 @@ impl ShardWriter {
 #[derive(Debug, Clone, Copy)]
 struct Place {
     tar: u32,
-    offset: u64,
-    size: u64,
+    member: Member,
 }
 
 /// Shards of any number of modalities, indexed by sample.
 #[derive(Debug, Clone)]
-pub struct Shards {
+pub struct ShardIndex {
     tars: Vec<PathBuf>,
     /// Stems in the order of their first appearance: shard by shard, data set by data set, the fullest tar first.
     samples: Vec<String>,
     modalities: BTreeMap<String, BTreeMap<String, Place>>,
 }
 
-impl Shards {
+impl ShardIndex {
     /// Indexes all shards below `root/<modality>/`.
     ///
     /// # Errors
@@ -169,11 +169,11 @@ impl Shards {
         for modality in children(root)? {
             if modality.is_dir() {
                 let name = file_name(&modality);
-                tars_below(&modality, 3, &mut |path| {
-                    let folder = path.parent().unwrap_or(path);
+                for path in tar::below(&modality, 3).map_err(|e| damaged(&modality, e))? {
+                    let folder = path.parent().unwrap_or(&path);
                     let dataset = folder.strip_prefix(&modality).unwrap_or(folder).to_owned();
-                    found.push((file_name(path), dataset, name.clone(), path.to_owned()));
-                })?;
+                    found.push((file_name(&path), dataset, name.clone(), path));
+                }
             }
         }
         if found.is_empty() {
@@ -252,18 +252,13 @@ impl Shards {
         };
         let path = &self.tars[place.tar as usize];
         let mut file = File::open(path).map_err(io(path))?;
-        file.seek(SeekFrom::Start(place.offset)).map_err(io(path))?;
-        let mut bytes = Vec::with_capacity(place.size as usize);
-        file.take(place.size)
-            .read_to_end(&mut bytes)
-            .map_err(io(path))?;
-        if bytes.len() as u64 != place.size {
-            return Err(ShardError::Member {
-                path: path.clone(),
-                member: stem.clone(),
-                reason: "the file has become shorter".to_owned(),
-            });
-        }
+        let bytes = place.member.read(&mut file).map_err(|error| {
+            if error.kind() == std::io::ErrorKind::UnexpectedEof {
+                self.member_error(sample, modality, "the file has become shorter")
+            } else {
+                io(path)(error)
+            }
+        })?;
         Ok(Some(bytes))
     }
 
@@ -300,58 +295,42 @@ fn children(folder: &Path) -> Result<Vec<PathBuf>, ShardError> {
     Ok(paths)
 }
 
-fn tars_below(folder: &Path, depth: usize, each: &mut impl FnMut(&Path)) -> Result<(), ShardError> {
-    for path in children(folder)? {
-        if path.is_dir() && depth > 0 {
-            tars_below(&path, depth - 1, each)?;
-        } else if path.extension().is_some_and(|e| e == "tar") {
-            each(&path);
-        }
+/// What is wrong with a tar, or with a folder of them.
+fn damaged(path: &Path, error: FormatError) -> ShardError {
+    match error {
+        FormatError::File { path, source } => damaged(&path, *source),
+        FormatError::Io(error) => io(path)(error),
+        FormatError::Malformed { offset, reason, .. } => ShardError::Tar {
+            path: path.to_owned(),
+            offset,
+            reason,
+        },
+        error => ShardError::Tar {
+            path: path.to_owned(),
+            offset: 0,
+            reason: error.to_string(),
+        },
     }
-    Ok(())
 }
 
-/// Reads the headers of a tar.
+/// The members of a tar by stem.
 fn index(path: &Path, tar: u32) -> Result<Vec<(String, Place)>, ShardError> {
-    let file = File::open(path).map_err(io(path))?;
-    let length = file.metadata().map_err(io(path))?.len();
-    let mut archive = tar::Archive::new(file);
-    let damaged = |offset: u64, reason: String| ShardError::Tar {
-        path: path.to_owned(),
-        offset,
-        reason,
-    };
+    let headers = tar::headers(path).map_err(|error| damaged(path, error))?;
     let mut members = Vec::new();
-    let (mut offset, mut end) = (0, 0);
-    for entry in archive
-        .entries_with_seek()
-        .map_err(|e| damaged(0, e.to_string()))?
-    {
-        let entry = entry.map_err(|e| damaged(offset, e.to_string()))?;
-        offset = entry.raw_file_position();
-        let size = entry.size();
-        if offset.checked_add(size).is_none_or(|end| end > length) {
-            return Err(damaged(
-                offset,
-                format!("a member of {size} bytes in a file of {length}"),
-            ));
-        }
-        end = offset + size;
-        if !entry.header().entry_type().is_file() {
-            continue;
-        }
-        let name = entry.path_bytes();
-        let name = std::str::from_utf8(&name)
-            .map_err(|_| damaged(offset, "a name that is not UTF-8".to_owned()))?;
+    for header in headers.into_iter().filter(|header| header.is_file) {
+        let wrong = |reason: String| ShardError::Tar {
+            path: path.to_owned(),
+            offset: header.member.offset,
+            reason,
+        };
+        let name = std::str::from_utf8(&header.name)
+            .map_err(|_| wrong("a name that is not UTF-8".to_owned()))?;
         let stem = name
             .strip_suffix(".npz")
             .or_else(|| name.strip_suffix(".npy"))
-            .ok_or_else(|| damaged(offset, format!("`{name}` is neither .npz nor .npy")))?;
-        let place = Place { tar, offset, size };
-        members.push((stem.to_owned(), place));
-    }
-    if !tar_has_end(length, end) {
-        return Err(damaged(end, TAR_CUT.to_owned()));
+            .ok_or_else(|| wrong(format!("`{name}` is neither .npz nor .npy")))?;
+        let member = header.member;
+        members.push((stem.to_owned(), Place { tar, member }));
     }
     Ok(members)
 }
@@ -374,7 +353,7 @@ mod tests {
             }
             writer.finish().unwrap();
         }
-        let shards = Shards::open(folder.path()).unwrap();
+        let shards = ShardIndex::open(folder.path()).unwrap();
         let expected: Vec<String> = (0..6).rev().map(|i| format!("world/{i:06}")).collect();
         assert_eq!(shards.samples(), expected);
         assert_eq!(shards.modalities().collect::<Vec<_>>(), ["camera", "gaze"]);
@@ -401,7 +380,7 @@ mod tests {
             }
         }
         writer.finish().unwrap();
-        let shards = Shards::open(folder.path()).unwrap();
+        let shards = ShardIndex::open(folder.path()).unwrap();
         assert_eq!(
             shards.samples(),
             ["adt/0", "adt/1", "adt/2", "world/0", "world/1", "world/2"]
@@ -425,7 +404,7 @@ mod tests {
         writer.add("camera/world", "a", b"1").unwrap();
         drop(writer);
         assert!(matches!(
-            Shards::open(folder.path()),
+            ShardIndex::open(folder.path()),
             Err(ShardError::Empty(_))
         ));
     }
@@ -445,7 +424,7 @@ mod tests {
         // Between two members, too: a member is 1536 bytes with its header, and two empty blocks are the end.
         for cut in [0, 1, 300, 512, 800, 1300, 1536, 2500, 4 * 1536] {
             std::fs::write(&path, &good[..cut]).unwrap();
-            let message = Shards::open(folder.path()).unwrap_err().to_string();
+            let message = ShardIndex::open(folder.path()).unwrap_err().to_string();
             assert!(
                 message.contains("shard-000000.tar") && message.contains("byte"),
                 "{cut}: {message}"
@@ -453,13 +432,13 @@ mod tests {
         }
         // GNU tar, too, is content with one of them.
         std::fs::write(&path, &good[..4 * 1536 + 512]).unwrap();
-        assert_eq!(Shards::open(folder.path()).unwrap().count("camera"), 4);
+        assert_eq!(ShardIndex::open(folder.path()).unwrap().count("camera"), 4);
         let mut errors = 0;
         for at in 0..600 {
             let mut bad = good.clone();
             bad[at] ^= 0x41;
             std::fs::write(&path, &bad).unwrap();
-            match Shards::open(folder.path()) {
+            match ShardIndex::open(folder.path()) {
                 Ok(shards) => (0..shards.samples().len()).for_each(|i| {
                     let _ = shards.read(i, "camera");
                 }),
@@ -473,7 +452,7 @@ mod tests {
         let sum: u32 = huge[..512].iter().map(|b| u32::from(*b)).sum();
         huge[148..156].copy_from_slice(format!("{sum:06o}\0 ").as_bytes());
         std::fs::write(&path, &huge).unwrap();
-        let message = Shards::open(folder.path()).unwrap_err().to_string();
+        let message = ShardIndex::open(folder.path()).unwrap_err().to_string();
         assert!(message.contains("shard-000000.tar"), "{message}");
         assert!(errors > 200, "{errors}");
     }

@@ -4,7 +4,7 @@
 //! grid.
 
 use super::Clip;
-use super::shard::{ShardError, ShardWriter, Shards};
+use super::shard::{ShardError, ShardIndex, ShardWriter};
 use crate::formats::FormatError;
 use crate::formats::npz::Npz;
 use crate::modality;
@@ -47,7 +47,7 @@ fn add_clip(writer: &mut ShardWriter, clip: &Clip) -> Result<(), ShardError> {
 /// Clips in shards, read one at a time.
 #[derive(Debug, Clone)]
 pub struct ClipSet {
-    shards: Shards,
+    shards: ShardIndex,
     source: String,
 }
 
@@ -58,7 +58,7 @@ impl ClipSet {
     /// When there are none or a tar is damaged.
     pub fn open(root: &Path) -> Result<Self, ShardError> {
         Ok(Self {
-            shards: Shards::open(root)?,
+            shards: ShardIndex::open(root)?,
             source: String::new(),
         })
     }
@@ -79,7 +79,7 @@ impl ClipSet {
     }
 
     /// The shards underneath.
-    pub fn shards(&self) -> &Shards {
+    pub fn shards(&self) -> &ShardIndex {
         &self.shards
     }
 

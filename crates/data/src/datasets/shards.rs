@@ -8,7 +8,9 @@ use super::{ClipSource, Outcome, ReadError};
 use crate::clip::Clip;
 use crate::clip::shard::ShardError;
 use crate::clip::store::{self, ClipSet};
+use crate::formats::FormatError;
 use crate::formats::read_error::Position;
+use crate::formats::tar;
 use crate::formats::text::read_json;
 use crate::formats::write_atomically;
 use crate::modality::ClipFormat;
@@ -125,28 +127,19 @@ impl Content {
 /// # Errors
 /// When a folder cannot be read.
 pub fn tars(root: &Path) -> Result<Vec<String>, ReadError> {
-    fn descend(
-        root: &Path,
-        folder: &Path,
-        depth: usize,
-        found: &mut Vec<String>,
-    ) -> Result<(), ReadError> {
-        let fail = |cause| ReadError::io(folder, cause);
-        for entry in std::fs::read_dir(folder).map_err(fail)? {
-            let path = entry.map_err(fail)?.path();
-            if path.is_dir() {
-                if depth > 0 {
-                    descend(root, &path, depth - 1, found)?;
-                }
-            } else if path.extension().is_some_and(|extension| extension == "tar") {
-                let inside = path.strip_prefix(root).unwrap_or(&path);
-                found.push(inside.to_string_lossy().into_owned());
-            }
-        }
-        Ok(())
-    }
-    let mut found = Vec::new();
-    descend(root, root, 2, &mut found)?;
+    let found = tar::below(root, 2).map_err(|error| match error {
+        FormatError::File { path, source } => match *source {
+            FormatError::Io(cause) => ReadError::io(&path, cause),
+            source => source.in_file(&path).into(),
+        },
+        error => error.into(),
+    })?;
+    let inside = found
+        .iter()
+        .map(|path| path.strip_prefix(root).unwrap_or(path));
+    let mut found: Vec<String> = inside
+        .map(|path| path.to_string_lossy().into_owned())
+        .collect();
     found.sort();
     Ok(found)
 }

@@ -1,7 +1,7 @@
 //! Container formats that carry arrays and pictures, read with bounded memory.
 //!
 //! Read in this order: [`zip`] (archives, also the shell of npz and of released checkpoints), [`npy`] (one array), [`npz`]
-//! (named arrays), [`pickle`] (an interpreter that can only describe data), [`png`] (pictures). Every reader takes untrusted
+//! (named arrays), [`pickle`] (an interpreter that can only describe data), [`png`] (pictures), [`tar`] (shards). Every reader takes untrusted
 //! bytes: a malformed file is a [`FormatError`] that says where and why, a recording that cannot be read is a [`ReadError`], and
 //! no length field is believed before it has been compared with the size of the file.
 
@@ -10,6 +10,7 @@ pub mod npz;
 pub mod pickle;
 pub mod png;
 pub mod read_error;
+pub mod tar;
 pub mod text;
 pub mod zip;
 

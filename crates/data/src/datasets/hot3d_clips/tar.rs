@@ -2,13 +2,13 @@
 
 use crate::datasets::ReadError;
 use crate::datasets::recording::ColourFrames;
+use crate::formats::FormatError;
 use crate::formats::read_error::Position;
-use crate::formats::{TAR_CUT, tar_has_end};
+use crate::formats::tar::{self, Header, Member};
 use crate::video::image::Image;
 use serde::de::DeserializeOwned;
 use std::collections::BTreeMap;
 use std::fs::File;
-use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
 pub(super) const SHAPES: &str = "__hand_shapes.json__";
@@ -16,13 +16,6 @@ pub(super) const SHAPES: &str = "__hand_shapes.json__";
 const LONGEST_TEXT: u64 = 64 << 20;
 /// No picture of these cameras is larger.
 const LONGEST_PICTURE: u64 = 64 << 20;
-
-/// Where a member is.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Member {
-    pub(super) offset: u64,
-    pub(super) size: u64,
-}
 
 /// The members of a frame that matter.
 #[derive(Debug, Default)]
@@ -44,29 +37,11 @@ pub(super) struct Tar {
 impl Tar {
     /// One pass over the headers, in whatever order the members are.
     pub(super) fn index(path: &Path) -> Result<Self, ReadError> {
-        let io = |cause| ReadError::io(path, cause);
-        let damaged = |offset: u64, reason: String| {
-            ReadError::malformed(path, Position::Offset(offset), reason)
-        };
-        let file = File::open(path).map_err(io)?;
-        let length = file.metadata().map_err(io)?.len();
-        let mut archive = ::tar::Archive::new(File::open(path).map_err(io)?);
+        let file = File::open(path).map_err(|cause| ReadError::io(path, cause))?;
         let (mut frames, mut shapes) = (BTreeMap::<u32, Frame>::new(), None);
-        let (mut offset, mut end) = (0, 0);
-        let entries = archive
-            .entries_with_seek()
-            .map_err(|error| damaged(0, error.to_string()))?;
-        for entry in entries {
-            let entry = entry.map_err(|error| damaged(offset, error.to_string()))?;
-            offset = entry.raw_file_position();
-            let size = entry.size();
-            if offset.checked_add(size).is_none_or(|end| end > length) {
-                let reason = format!("a member of {size} bytes in a file of {length}");
-                return Err(damaged(offset, reason));
-            }
-            end = offset + size;
-            let member = Member { offset, size };
-            let name = entry.path_bytes();
+        for Header { name, member, .. } in
+            tar::headers(path).map_err(|error| damaged(path, error))?
+        {
             let name = String::from_utf8_lossy(&name);
             let name = name.rsplit('/').next().unwrap_or(&name);
             if name == SHAPES {
@@ -93,13 +68,12 @@ impl Tar {
                 }
             }
         }
-        if !tar_has_end(length, end) {
-            return Err(damaged(end, TAR_CUT.to_owned()));
-        }
         if frames.is_empty() {
-            return Err(damaged(
-                0,
-                "there are no frames of HOT3D-Clips in it".to_owned(),
+            let place = Position::Offset(0);
+            return Err(ReadError::malformed(
+                path,
+                place,
+                "there are no frames of HOT3D-Clips in it",
             ));
         }
         Ok(Tar {
@@ -132,11 +106,20 @@ fn read(path: &Path, mut file: &File, member: Member, most: u64) -> Result<Vec<u
             format!("a member of {} bytes", member.size),
         ));
     }
-    let mut bytes = vec![0; member.size as usize];
-    file.seek(SeekFrom::Start(member.offset))
-        .and_then(|_| file.read_exact(&mut bytes))
-        .map_err(|cause| ReadError::io(path, cause))?;
-    Ok(bytes)
+    member
+        .read(&mut file)
+        .map_err(|cause| ReadError::io(path, cause))
+}
+
+fn damaged(path: &Path, error: FormatError) -> ReadError {
+    match error {
+        FormatError::File { path, source } => damaged(&path, *source),
+        FormatError::Io(cause) => ReadError::io(path, cause),
+        FormatError::Malformed { offset, reason, .. } => {
+            ReadError::malformed(path, Position::Offset(offset), reason)
+        }
+        error => ReadError::malformed(path, Position::File, error.to_string()),
+    }
 }
 
 /// Pictures inside a tar.
