@@ -49,15 +49,15 @@ impl Group {
     }
 }
 
-/// The plan for the targets `names`; `given[m]` says which modalities have input tokens, `open[m]` how many are still open.
+/// The plan for the targets `names`; `is_input[m]` says which modalities have input tokens, `masked_tokens[m]` how many are still masked.
 ///
 /// # Errors
 /// When a name is unknown or a target is raw video.
 pub fn plan(
     settings: &DecodingSettings,
     modalities: &[TokenModality],
-    given: &[bool],
-    open: &[usize],
+    is_input: &[bool],
+    masked_tokens: &[usize],
     names: &[&str],
 ) -> Result<Vec<Chain>, DecodingError> {
     let index = |name: &str| {
@@ -83,14 +83,14 @@ pub fn plan(
     }
     let hidden: Vec<bool> = match &settings.uncond_drop {
         None => (0..modalities.len())
-            .map(|m| given[m] && !targets.contains(&m))
+            .map(|m| is_input[m] && !targets.contains(&m))
             .collect(),
         // A name the model does not have hides nothing: presets name the inputs of every model.
         Some(names) => modalities.iter().map(|m| names.contains(&m.name)).collect(),
     };
     let target = |modality: usize| {
         let settings = settings.target(&modalities[modality].name);
-        let counts = settings.schedule_counts(open[modality]);
+        let counts = settings.schedule_counts(masked_tokens[modality]);
         Target {
             modality,
             temperatures: settings
@@ -126,7 +126,7 @@ pub fn plan(
             }],
         }],
         Order::Pooled => {
-            let masked = targets.iter().map(|&m| open[m]).sum();
+            let masked = targets.iter().map(|&m| masked_tokens[m]).sum();
             let counts = super::schedule::linear(settings.all.steps, masked);
             let in_pool = |&m: &usize| {
                 let mut target = target(m);
@@ -208,11 +208,11 @@ mod tests {
             chains: vec![vec!["right_hand".into(), "left_hand".into()]],
             ..DecodingSettings::default()
         };
-        let given = [true, false, false, false];
+        let is_input = [true, false, false, false];
         let chains = plan(
             &settings,
             &modalities(),
-            &given,
+            &is_input,
             &[30; 4],
             &["left_hand", "camera", "right_hand"],
         )

@@ -5,7 +5,7 @@ use super::published::Published;
 pub use super::row_scores::IntervalSettings;
 use super::row_scores::{AlignedScores, RowScores, add_differences};
 use super::samples;
-use super::scores::{FLOOR, Scores};
+use super::scores::{RECONSTRUCTION_BOUND, Scores};
 use super::statistics::{Over, least_p, least_p_of_trainings};
 use super::table::{Cell, Row, RowKind, Table};
 use super::verdict;
@@ -121,9 +121,10 @@ pub fn compare(
     }
     add_differences(&mut rows, &sides, &reference, &columns, &settings.interval);
     if settings.trivial_baselines {
-        // They see only the truth, so any entrant's will do; the tokenizer floor is an entrant's own.
+        // They see only the truth, so any entrant's will do; the reconstruction bound is an entrant's own.
         let trivial = first.seeds[0].baselines.iter();
-        let of_the_truth = |name: &str| name != FLOOR && !name.starts_with(samples::PREFIX);
+        let of_the_truth =
+            |name: &str| name != RECONSTRUCTION_BOUND && !name.starts_with(samples::PREFIX);
         for (name, set) in trivial.filter(|(name, _)| of_the_truth(name)) {
             let side = RowScores {
                 sets: vec![AlignedScores::of(&first.seeds[0], set, &common)],
@@ -141,7 +142,7 @@ pub fn compare(
             }
         }
         rows.extend(sampled(entrants, &columns, &common, &settings.interval));
-        rows.extend(floors(entrants, &columns, &common, &settings.interval));
+        rows.extend(bounds(entrants, &columns, &common, &settings.interval));
     }
     rows.extend(published.map(|p| p.rows(&columns)).unwrap_or_default());
     let mut table = Table {
@@ -211,8 +212,8 @@ fn sampled(
     rows
 }
 
-/// The tokenizer floors: one row for all entrants that share their tokenizers, named after them where not all do.
-fn floors<'a>(
+/// The reconstruction bounds: one row for all entrants that share their tokenizers, named after them where not all do.
+fn bounds<'a>(
     entrants: &'a [Method],
     columns: &[Column],
     common: &[String],
@@ -223,7 +224,7 @@ fn floors<'a>(
         let of = |scores: &'a Scores| {
             Some(AlignedScores::of(
                 scores,
-                scores.baselines.get(FLOOR)?,
+                scores.baselines.get(RECONSTRUCTION_BOUND)?,
                 common,
             ))
         };
@@ -233,7 +234,7 @@ fn floors<'a>(
         if cells.iter().all(|cell| cell.value.is_none()) {
             continue;
         }
-        // An entrant that predicts less has fewer columns of the same floor.
+        // An entrant that predicts less has fewer columns of the same bound.
         let agrees = |known: &[Cell]| {
             let mut both = known.iter().zip(&cells);
             both.all(|(a, b)| a.value.is_none() || b.value.is_none() || a == b)
@@ -252,9 +253,9 @@ fn floors<'a>(
     }
     let row = |(names, cells): (Vec<&str>, Vec<Cell>)| Row {
         label: if names.len() == entrants.len() {
-            FLOOR.to_owned()
+            RECONSTRUCTION_BOUND.to_owned()
         } else {
-            format!("{FLOOR}: {}", names.join(", "))
+            format!("{RECONSTRUCTION_BOUND}: {}", names.join(", "))
         },
         kind: RowKind::Baseline,
         cells,
@@ -550,12 +551,12 @@ mod tests {
     }
 
     #[test]
-    fn floors_are_one_row_where_tokenizers_are_shared_and_named_where_they_are_not() {
-        let entrant = |label: &str, floor: Option<f64>| {
+    fn bounds_are_one_row_where_tokenizers_are_shared_and_named_where_they_are_not() {
+        let entrant = |label: &str, bound: Option<f64>| {
             let mut own = scores(1, 0..9, 10.0);
-            if let Some(shift) = floor {
+            if let Some(shift) = bound {
                 let set = scores(2, 0..9, shift).own;
-                own.baselines.insert(FLOOR.to_owned(), set);
+                own.baselines.insert(RECONSTRUCTION_BOUND.to_owned(), set);
             }
             Method {
                 label: label.into(),
@@ -564,20 +565,23 @@ mod tests {
         };
         let rows = |entrants: &[Method]| -> Vec<String> {
             let table = compare("", entrants, &CompareSettings::default(), None).unwrap();
-            let floors = table.rows.iter().filter(|r| r.kind == RowKind::Baseline);
-            floors.map(|row| row.label.clone()).collect()
+            let bounds = table.rows.iter().filter(|r| r.kind == RowKind::Baseline);
+            bounds.map(|row| row.label.clone()).collect()
         };
         let (a, b, c) = (
             entrant("a", Some(0.0)),
             entrant("b", Some(0.0)),
             entrant("c", Some(3.0)),
         );
-        assert_eq!(rows(&[a.clone(), b.clone()]), ["tokenizer floor"]);
+        assert_eq!(rows(&[a.clone(), b.clone()]), ["reconstruction bound"]);
         assert_eq!(
             rows(&[a.clone(), b, c]),
-            ["tokenizer floor: a, b", "tokenizer floor: c"]
+            ["reconstruction bound: a, b", "reconstruction bound: c"]
         );
-        assert_eq!(rows(&[entrant("theirs", None), a]), ["tokenizer floor: a"]);
+        assert_eq!(
+            rows(&[entrant("theirs", None), a]),
+            ["reconstruction bound: a"]
+        );
     }
 
     #[test]

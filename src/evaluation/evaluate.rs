@@ -5,7 +5,7 @@ use super::depth;
 use super::metric::{AllClips, Baseline, ClipScore, Mean, MetricSet, OverClips, Pair, set_of};
 use super::outcome::{MetricError, Outcome};
 use super::samples;
-use super::scores::{ColumnScores, FLOOR, FORMAT, ScoreSet, Scores, SetScore};
+use super::scores::{ColumnScores, FORMAT, RECONSTRUCTION_BOUND, ScoreSet, Scores, SetScore};
 use super::suite::{Suite, UnknownMetric};
 use crate::clip::Clip;
 use ndarray::Array2;
@@ -38,7 +38,7 @@ pub trait Pairs: Sync {
     ///
     /// # Errors
     /// When it cannot be computed.
-    fn tokenizer_floor(&self, _index: usize) -> Result<Option<Clip>, LoadError> {
+    fn reconstruction_bound(&self, _index: usize) -> Result<Option<Clip>, LoadError> {
         Ok(None)
     }
 
@@ -57,7 +57,7 @@ pub enum EvaluationError {
     /// The suite names a metric that is no column.
     #[error(transparent)]
     Metric(#[from] UnknownMetric),
-    /// A clip could not be read: the truth, the prediction or the tokenizer floor.
+    /// A clip could not be read: the truth, the prediction or the reconstruction bound.
     #[error("clip `{clip}`: {error}")]
     Load {
         /// Its id.
@@ -336,8 +336,8 @@ impl Plan {
                 baselines.entry(name).or_insert_with(empty)[position].values = values;
             }
         }
-        if let Some(floor) = pairs.tokenizer_floor(index).map_err(load)? {
-            baselines.insert(FLOOR, score(&floor)?);
+        if let Some(bound) = pairs.reconstruction_bound(index).map_err(load)? {
+            baselines.insert(RECONSTRUCTION_BOUND, score(&bound)?);
         }
         let samples = pairs.samples(index).map_err(load)?;
         let samples: Vec<Scored> = samples.iter().map(score).collect::<Result<_, _>>()?;
@@ -594,7 +594,7 @@ mod tests {
             let scores = scores(&walks).unwrap();
             let fid = scores.own.set("body.kin_fid").unwrap().clone();
             assert_eq!(fid.value.is_none(), fid.unavailable.is_some());
-            assert!(!scores.baselines.contains_key(FLOOR));
+            assert!(!scores.baselines.contains_key(RECONSTRUCTION_BOUND));
             fid.unavailable
         };
         let needs = Some("needs two clips with every joint valid".to_owned());

@@ -6,16 +6,16 @@ use crate::clip::store::ClipSet;
 use crate::reconstruction::predictions::{Predictions, PredictionsError};
 use std::collections::BTreeMap;
 
-/// The tokenizer floor that predictions of a model bring with them.
+/// The reconstruction bound that predictions of a model bring with them.
 #[derive(Debug)]
-struct Floor {
+struct Bound {
     clips: Option<Predictions>,
     position: BTreeMap<String, usize>,
 }
 
-impl Floor {
+impl Bound {
     fn of(predictions: &Predictions) -> Result<Self, PredictionsError> {
-        let clips = predictions.floor()?;
+        let clips = predictions.reconstruction_bound()?;
         let position = clips.as_ref().map(Predictions::positions);
         Ok(Self {
             clips,
@@ -57,7 +57,7 @@ pub struct Folders {
     predictions: Predictions,
     /// Position of a clip among the predictions.
     position: BTreeMap<String, usize>,
-    floor: Floor,
+    bound: Bound,
     samples: Samples,
 }
 
@@ -65,7 +65,7 @@ impl Folders {
     /// Every clip of `truth` is scored; predictions of other clips are left alone.
     ///
     /// # Errors
-    /// When the predictions bring a tokenizer floor that cannot be opened.
+    /// When the predictions bring a reconstruction bound that cannot be opened.
     pub fn new(truth: Predictions, predictions: Predictions) -> Result<Self, PredictionsError> {
         let ids = truth
             .index
@@ -77,7 +77,7 @@ impl Folders {
             ids,
             truth,
             position: predictions.positions(),
-            floor: Floor::of(&predictions)?,
+            bound: Bound::of(&predictions)?,
             samples: Samples::of(&predictions)?,
             predictions,
         })
@@ -100,8 +100,8 @@ impl Pairs for Folders {
         }
     }
 
-    fn tokenizer_floor(&self, index: usize) -> Result<Option<Clip>, LoadError> {
-        self.floor.clip(&self.ids[index])
+    fn reconstruction_bound(&self, index: usize) -> Result<Option<Clip>, LoadError> {
+        self.bound.clip(&self.ids[index])
     }
 
     fn samples(&self, index: usize) -> Result<Vec<Clip>, LoadError> {
@@ -115,9 +115,9 @@ pub enum StoredError {
     /// A prediction has no true clip; holds its clip id.
     #[error("clip `{0}` was predicted but is not among the true clips")]
     NotTrue(String),
-    /// The tokenizer floor that the predictions bring cannot be opened.
+    /// The reconstruction bound that the predictions bring cannot be opened.
     #[error(transparent)]
-    Floor(#[from] PredictionsError),
+    Bound(#[from] PredictionsError),
 }
 
 /// True clips in shards and predictions of them, matched by clip id.
@@ -128,7 +128,7 @@ pub struct Stored {
     /// Position of a scored clip in `truth` and among the predictions.
     positions: Vec<(usize, usize)>,
     predictions: Predictions,
-    floor: Floor,
+    bound: Bound,
     samples: Samples,
 }
 
@@ -136,7 +136,7 @@ impl Stored {
     /// Every clip that was predicted is scored.
     ///
     /// # Errors
-    /// A prediction without a true clip, or a tokenizer floor that cannot be opened.
+    /// A prediction without a true clip, or a reconstruction bound that cannot be opened.
     pub fn new(truth: ClipSet, predictions: Predictions) -> Result<Self, StoredError> {
         let known: BTreeMap<&str, usize> = truth
             .ids()
@@ -157,7 +157,7 @@ impl Stored {
             ids,
             truth,
             positions,
-            floor: Floor::of(&predictions)?,
+            bound: Bound::of(&predictions)?,
             samples: Samples::of(&predictions)?,
             predictions,
         })
@@ -177,8 +177,8 @@ impl Pairs for Stored {
         Ok(Some(self.predictions.load(self.positions[index].1)?))
     }
 
-    fn tokenizer_floor(&self, index: usize) -> Result<Option<Clip>, LoadError> {
-        self.floor.clip(&self.ids[index])
+    fn reconstruction_bound(&self, index: usize) -> Result<Option<Clip>, LoadError> {
+        self.bound.clip(&self.ids[index])
     }
 
     fn samples(&self, index: usize) -> Result<Vec<Clip>, LoadError> {

@@ -19,7 +19,7 @@ pub struct Scores {
     pub clips: Vec<String>,
     /// The system's own scores.
     pub own: ScoreSet,
-    /// `still camera`, `image centre`, `mean pose`, `mean depth image`, `mean value`, `tokenizer floor`: only the columns they have.
+    /// `still camera`, `image centre`, `mean pose`, `mean depth image`, `mean value`, `reconstruction bound`: only the columns they have.
     pub baselines: BTreeMap<String, ScoreSet>,
     /// Clips that were not scored, by reason.
     pub left_out: BTreeMap<String, usize>,
@@ -30,7 +30,7 @@ pub struct Scores {
 }
 
 /// The baseline that belongs to the system: the truth after a round trip through its tokenizers.
-pub const FLOOR: &str = "tokenizer floor";
+pub const RECONSTRUCTION_BOUND: &str = "reconstruction bound";
 
 /// The current [`Scores::format`].
 pub const FORMAT: u32 = 1;

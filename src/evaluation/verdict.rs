@@ -2,7 +2,7 @@
 
 use super::columns::Better;
 use super::samples::PREFIX;
-use super::scores::FLOOR;
+use super::scores::RECONSTRUCTION_BOUND;
 use super::table::{Cell, Row, RowKind, Table};
 
 /// How a system stands against the best trivial baseline of a column.
@@ -53,14 +53,16 @@ fn sentence(table: &Table, row: &Row) -> Option<String> {
     (!parts.is_empty()).then(|| format!("{} {}", row.label, parts.join("; ")))
 }
 
-/// The trivial baseline with the best value. The tokenizer floor is what can be reached, not what has to be beaten.
+/// The trivial baseline with the best value. The reconstruction bound is what can be reached, not what has to be beaten.
 fn best_trivial(table: &Table, position: usize) -> Option<(&str, &Cell)> {
     let sign = table.columns[position].better.sign();
     table
         .rows
         .iter()
         .filter(|row| row.kind == RowKind::Baseline)
-        .filter(|row| !row.label.starts_with(FLOOR) && !row.label.starts_with(PREFIX))
+        .filter(|row| {
+            !row.label.starts_with(RECONSTRUCTION_BOUND) && !row.label.starts_with(PREFIX)
+        })
         .filter_map(|row| {
             let cell = &row.cells[position];
             cell.value.map(|value| (sign * value, row, cell))
@@ -147,7 +149,7 @@ mod tests {
                     ],
                 ),
                 row(
-                    "tokenizer floor",
+                    "reconstruction bound",
                     RowKind::Baseline,
                     vec![
                         cell(1.0, None),

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, VecDeque};
 
 use burn::tensor::{Tensor, TensorData};
 
-use super::plan::{KEY_SLOTS, OVERLAP, STEP, wanted};
+use super::plan::{KEY_SLOTS, OVERLAP, STEP, needed_slots};
 use super::preprocess::{network_size, normalised, patches};
 use super::settings::WINDOW;
 use super::{DepthLabelKind, DepthNetwork, FrameFeatures, LabelError, Map, Stitcher};
@@ -119,7 +119,7 @@ impl DepthLabeller {
             let end = reader.ended.then_some(reader.taken);
             let last = end.is_some_and(|frames| frames <= (index + 1) * STEP);
             // Before its end is reached, a video has more frames than this window shows.
-            let slots = wanted(index, end.unwrap_or(usize::MAX / 2), fitted);
+            let slots = needed_slots(index, end.unwrap_or(usize::MAX / 2), fitted);
             let views: Vec<&FrameFeatures> = window.iter().collect();
             let mut maps = BTreeMap::new();
             self.network.decode(&views, &slots, &mut |slot, values| {

@@ -37,7 +37,7 @@ pub fn plan(frames: usize) -> Vec<[usize; WINDOW]> {
 /// The slots of window `window` whose depth the result of a video of `frames` frames depends on. Slots 0 and 1 serve the fit of
 /// relative depth; blending starts with slot 3 (slot 2 has no weight) and leaves nothing of the last slot.
 #[must_use]
-pub fn wanted(window: usize, frames: usize, fitted: bool) -> Vec<usize> {
+pub fn needed_slots(window: usize, frames: usize, fitted: bool) -> Vec<usize> {
     let last = window + 1 == windows(frames);
     (0..WINDOW)
         .filter(|slot| {
@@ -71,12 +71,12 @@ mod tests {
 
     #[test]
     fn only_slots_that_change_the_result_are_wanted() {
-        assert_eq!(wanted(0, 1, true), [0]);
-        assert_eq!(wanted(0, 22, true).len(), 22);
-        assert_eq!(wanted(0, 40, true), (0..31).collect::<Vec<_>>());
-        let second = wanted(1, 40, true);
+        assert_eq!(needed_slots(0, 1, true), [0]);
+        assert_eq!(needed_slots(0, 22, true).len(), 22);
+        assert_eq!(needed_slots(0, 40, true), (0..31).collect::<Vec<_>>());
+        let second = needed_slots(1, 40, true);
         assert_eq!(second[..3], [0, 1, 3]);
         assert_eq!(second.last(), Some(&17));
-        assert_eq!(wanted(1, 40, false)[0], 3);
+        assert_eq!(needed_slots(1, 40, false)[0], 3);
     }
 }

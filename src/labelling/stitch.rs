@@ -141,7 +141,7 @@ impl Stitcher {
         }
     }
 
-    /// Adds the next window: maps by slot; those of [`super::plan::wanted`] suffice. `frames` is how many frames the video has,
+    /// Adds the next window: maps by slot; those of [`super::plan::needed_slots`] suffice. `frames` is how many frames the video has,
     /// where its end was reached. Finished frames go to `sink`, `[height * width]` each. Gives what the window was fitted by.
     ///
     /// # Errors
@@ -238,7 +238,7 @@ mod tests {
         for (index, slots) in plan.iter().enumerate() {
             let scale = 1.0 + index as f32 * 0.5;
             let relative = kind == DepthLabelKind::Relative;
-            let window = plan::wanted(index, frames, relative)
+            let window = plan::needed_slots(index, frames, relative)
                 .into_iter()
                 .map(|slot| {
                     let mut values = truth(slots[slot]);

@@ -162,7 +162,7 @@ impl Pairs for Predicted<'_> {
         Ok(self.predictions.get(index).cloned())
     }
 
-    fn tokenizer_floor(&self, index: usize) -> Result<Option<Clip>, LoadError> {
+    fn reconstruction_bound(&self, index: usize) -> Result<Option<Clip>, LoadError> {
         Ok(self.bounds.get(index).cloned())
     }
 }

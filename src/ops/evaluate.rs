@@ -79,7 +79,7 @@ impl Op for Evaluate {
     }
 
     fn version(&self) -> u32 {
-        4
+        5
     }
 
     fn about(&self) -> &'static str {

@@ -28,7 +28,7 @@ inventory::submit! { KindEntry::of::<Published>() }
 
 impl Kind for MaskingSettings {
     const KIND: &'static str = "masking";
-    const ABOUT: &'static str = "Which tokens are given, and which are asked for.";
+    const ABOUT: &'static str = "Which tokens are inputs, and which are targets.";
 }
 inventory::submit! { KindEntry::of::<MaskingSettings>() }
 

@@ -1,7 +1,7 @@
-//! `op: predict`: a model generates what it was not inputs, for every clip of a split (Supp. C).
+//! `op: predict`: a model generates the modalities that are not its inputs, for every clip of a split (Supp. C).
 //!
 //! Writes a folder of [`crate::reconstruction::predictions`]: decoded signals with a confidence per sample, and beside it the
-//! tokenizer floor: the clips' own signals after a round trip through the model's tokenizers. Several ranks predict a batch each at a
+//! reconstruction bound: the clips' own signals after a round trip through the model's tokenizers. Several ranks predict a batch each at a
 //! time.
 
 use super::device::{SMALLER_FORWARD, compute, memory_is_full};
@@ -19,7 +19,7 @@ use crate::masking::PIXELS;
 use crate::mget::MgetSpec;
 use crate::model::{GenerationRequest, Model, ModelError};
 use crate::reconstruction::predictions::{
-    FLOOR, PredictedClip, PredictionsWriter, ScaleStatus, SignalNote, sample_folder,
+    RECONSTRUCTION_BOUND, PredictedClip, PredictionsWriter, ScaleStatus, SignalNote, sample_folder,
 };
 use crate::run::environment::Stopwatch;
 use schemars::JsonSchema;
@@ -51,7 +51,7 @@ pub struct PredictSettings {
     /// At most this many clips, the first ones; absent means all.
     #[schemars(range(min = 1))]
     pub limit: Option<usize>,
-    /// Also write the tokenizer floor, which `evaluate` shows beside every metric.
+    /// Also write the reconstruction bound, which `evaluate` shows beside every metric.
     pub reconstruction_bound: bool,
     /// Where the model runs.
     pub device: DeviceChoice,
@@ -118,7 +118,7 @@ impl Op for Predict {
     }
 
     fn version(&self) -> u32 {
-        4
+        5
     }
 
     fn together(&self) -> bool {
@@ -126,7 +126,7 @@ impl Op for Predict {
     }
 
     fn about(&self) -> &'static str {
-        "Generates the modalities a model was not inputs, for the clips of a split."
+        "Generates the modalities that are not inputs, for the clips of a split."
     }
 
     fn inputs(&self) -> &'static [Port] {
@@ -265,11 +265,11 @@ impl Op for Predict {
         let create = |folder: &Path, system: &str| {
             PredictionsWriter::create(folder, system, notes.clone()).map_err(StageError::other)
         };
-        // The predictions themselves, the floor, and the samples; folders of one form.
+        // The predictions themselves, the reconstruction bound, and the samples; folders of one form.
         let mut writers = vec![create(context.output(), "reviv")?];
         if settings.reconstruction_bound {
-            let folder = context.output().join(FLOOR);
-            writers.push(create(&folder, "tokenizer floor")?);
+            let folder = context.output().join(RECONSTRUCTION_BOUND);
+            writers.push(create(&folder, "reconstruction bound")?);
         }
         let samples = if settings.samples > 1 {
             settings.samples

@@ -41,7 +41,7 @@ pub enum Pixels {
 pub struct TrainMgetSettings {
     /// Depth and width.
     pub size: Entry<Size>,
-    /// What is given and what is asked for.
+    /// Which tokens are inputs, and which are targets.
     pub masking: Entry<MaskingSettings>,
     /// The modalities that take part; empty means all that have tokens.
     pub modalities: Vec<String>,

@@ -96,7 +96,7 @@ pub struct PredictedClip {
 }
 
 /// The folder beside the index with the truth after a round trip through the model's tokenizers, itself of this form.
-pub const FLOOR: &str = "floor";
+pub const RECONSTRUCTION_BOUND: &str = "reconstruction_bound";
 /// The folder beside the index with samples, one folder of this form each: `samples/00`, `samples/01`, ...
 pub const SAMPLES: &str = "samples";
 /// The index's file name.
@@ -283,12 +283,12 @@ impl Predictions {
         })
     }
 
-    /// The tokenizer floor of the same clips; `None` where the system has none.
+    /// The reconstruction bound of the same clips; `None` where the system has none.
     ///
     /// # Errors
     /// As [`Predictions::open`].
-    pub fn floor(&self) -> Result<Option<Self>, PredictionsError> {
-        let folder = self.directory.join(FLOOR);
+    pub fn reconstruction_bound(&self) -> Result<Option<Self>, PredictionsError> {
+        let folder = self.directory.join(RECONSTRUCTION_BOUND);
         folder
             .join(INDEX)
             .is_file()

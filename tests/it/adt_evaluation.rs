@@ -137,7 +137,7 @@ fn the_adt_sample_is_evaluated_against_arrays_with_known_mistakes() {
     assert!(mean(&scores.baselines["still camera"], "camera.rre") > 0.01);
     assert!(mean(&scores.baselines["image centre"], "gaze.mse") > own("gaze.mse"));
     assert!(
-        !scores.baselines.contains_key("tokenizer floor"),
+        !scores.baselines.contains_key("reconstruction bound"),
         "no model, no floor"
     );
 }

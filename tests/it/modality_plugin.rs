@@ -143,7 +143,7 @@ fn declared_and_coded_modalities_reach_the_table_beside_their_baseline() {
     };
     let own = row("reviv", RowKind::System);
     let mean = row("mean value", RowKind::Baseline);
-    let floor = row("tokenizer floor", RowKind::Baseline);
+    let floor = row("reconstruction bound", RowKind::Baseline);
     for ((own, mean), floor) in own.cells.iter().zip(&mean.cells).zip(&floor.cells) {
         assert_eq!((own.n, mean.n, floor.n), (4, 4, 4));
         for cell in [own, mean, floor] {
@@ -221,7 +221,7 @@ fn modalities_of_another_shape_go_from_clips_to_a_table_and_a_page() {
             .collect::<Vec<bool>>()
     };
     assert_eq!(has("reviv"), [true; 3]);
-    assert_eq!(has("tokenizer floor"), [true; 3]);
+    assert_eq!(has("reconstruction bound"), [true; 3]);
     assert_eq!(has("mean value"), [true, false, false]);
     assert_eq!(has("still object"), [false, true, true]);
 
