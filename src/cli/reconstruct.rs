@@ -215,7 +215,7 @@ impl Reconstruct {
             set.push(change("decoding", name));
         }
         if let Some(degrees) = self.fov {
-            set.push(change("lens.field_of_view", &degrees.to_string()));
+            set.push(change("camera.field_of_view", &degrees.to_string()));
         }
         if let Some(path) = &self.anchor {
             set.push(change("anchor", &text(path, runs)?));

@@ -26,6 +26,7 @@ const RENAMED: &[(&str, &str)] = &[
     ("floor", "reconstruction_bound"),
     ("hide", "uncond_drop"),
     ("draw", "sampling"),
+    ("lens", "camera"),
 ];
 
 /// What `old` is called since it was renamed, where that is one of the `known` keys.

@@ -14,8 +14,8 @@ use crate::experiment::{
     Problem, StageContext, StageError, StagePlan,
 };
 use crate::masking::PIXELS;
+use crate::reconstruction::camera::CameraSettings;
 use crate::reconstruction::floor::FloorFit;
-use crate::reconstruction::lens::LensSettings;
 use crate::reconstruction::windows::windows;
 use crate::video::VideoSettings;
 use schemars::JsonSchema;
@@ -56,7 +56,7 @@ pub struct ReconstructSettings {
     /// Seconds that neighbouring windows of two seconds have in common: 0.5, 1 or 1.5.
     pub overlap: f64,
     /// The camera, as far as it is known.
-    pub lens: LensSettings,
+    pub camera: CameraSettings,
     /// How depth becomes metric from the floor.
     pub floor: FloorFit,
     /// Metric depth of another model at the frames of the model's video, instead of the floor: npz, or a folder of EXR or
@@ -88,7 +88,7 @@ impl Default for ReconstructSettings {
             },
             samples: 1,
             overlap: 1.0,
-            lens: LensSettings::default(),
+            camera: CameraSettings::default(),
             floor: FloorFit::default(),
             anchor: None,
             anchor_model: None,
@@ -111,7 +111,7 @@ impl Op for Reconstruct {
     }
 
     fn version(&self) -> u32 {
-        6
+        7
     }
 
     fn about(&self) -> &'static str {
@@ -235,8 +235,8 @@ impl Op for Reconstruct {
         if let Err(error) = windows(1.0, settings.overlap) {
             problems.push(Problem::new(Code::E0202, "overlap", error.to_string()));
         }
-        if let Err(error) = settings.lens.first_pose() {
-            problems.push(Problem::new(Code::E0202, "lens.up", error.to_string()));
+        if let Err(error) = settings.camera.first_pose() {
+            problems.push(Problem::new(Code::E0202, "camera.up", error.to_string()));
         }
         Description::default()
     }

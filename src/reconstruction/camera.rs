@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 /// The head camera, as far as its owner knows it.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields, default)]
-pub struct LensSettings {
+pub struct CameraSettings {
     /// Horizontal field of view of the centre square in degrees, where there is no `calibration`.
     #[schemars(range(min = 1.0, max = 170.0))]
     pub field_of_view: f64,
@@ -19,7 +19,7 @@ pub struct LensSettings {
     pub up: Option<[f64; 3]>,
 }
 
-impl Default for LensSettings {
+impl Default for CameraSettings {
     fn default() -> Self {
         Self {
             field_of_view: 90.0,
@@ -49,7 +49,7 @@ pub struct Calibration {
 
 /// Why a camera cannot be used.
 #[derive(Debug, thiserror::Error, PartialEq)]
-pub enum LensError {
+pub enum CameraError {
     /// The field of view, in degrees, is out of its range.
     #[error("a field of view of {0} degrees is not between 1 and 170")]
     FieldOfView(f64),
@@ -73,7 +73,7 @@ pub enum LensError {
     Up,
 }
 
-impl LensSettings {
+impl CameraSettings {
     /// Intrinsics of the square frames of `side` pixels, cut from the centre of pictures of `width` x `height`.
     ///
     /// # Errors
@@ -82,11 +82,11 @@ impl LensSettings {
         &self,
         [width, height]: [u32; 2],
         side: u32,
-    ) -> Result<Intrinsics, LensError> {
+    ) -> Result<Intrinsics, CameraError> {
         let side_f = f64::from(side);
         let Some(own) = self.calibration else {
             if !(1.0..=170.0).contains(&self.field_of_view) {
-                return Err(LensError::FieldOfView(self.field_of_view));
+                return Err(CameraError::FieldOfView(self.field_of_view));
             }
             let focal = side_f / 2.0 / (self.field_of_view.to_radians() / 2.0).tan();
             let centre = (side_f - 1.0) / 2.0;
@@ -101,12 +101,12 @@ impl LensSettings {
         };
         let numbers = [own.fx, own.fy, own.cx, own.cy];
         if numbers.iter().any(|v| !v.is_finite()) || own.fx <= 0.0 || own.fy <= 0.0 {
-            return Err(LensError::Calibration);
+            return Err(CameraError::Calibration);
         }
         let same =
             u64::from(own.width) * u64::from(height) == u64::from(own.height) * u64::from(width);
         if !same || own.width == 0 {
-            return Err(LensError::Shape {
+            return Err(CameraError::Shape {
                 expected: [own.width, own.height],
                 found: [width, height],
             });
@@ -130,10 +130,10 @@ impl LensSettings {
     ///
     /// # Errors
     /// When `up` is no direction, or lies along the camera's right axis.
-    pub fn first_pose(&self) -> Result<Rigid, LensError> {
+    pub fn first_pose(&self) -> Result<Rigid, CameraError> {
         match self.up {
             None => Ok(level_camera()),
-            Some(up) => pose_with_up(Vector3::from(up)).ok_or(LensError::Up),
+            Some(up) => pose_with_up(Vector3::from(up)).ok_or(CameraError::Up),
         }
     }
 }
@@ -157,16 +157,16 @@ mod tests {
 
     #[test]
     fn ninety_degrees_reach_half_a_side_at_half_a_side() {
-        let lens = LensSettings::default()
+        let intrinsics = CameraSettings::default()
             .intrinsics([1920, 1080], 256)
             .unwrap();
-        assert!((lens.fx - 128.0).abs() < 1e-9);
-        assert_eq!(lens.cx, 127.5);
+        assert!((intrinsics.fx - 128.0).abs() < 1e-9);
+        assert_eq!(intrinsics.cx, 127.5);
     }
 
     #[test]
     fn a_calibration_follows_crop_and_resize() {
-        let settings = LensSettings {
+        let settings = CameraSettings {
             calibration: Some(Calibration {
                 fx: 600.0,
                 fy: 610.0,
@@ -175,17 +175,17 @@ mod tests {
                 width: 1920,
                 height: 1080,
             }),
-            ..LensSettings::default()
+            ..CameraSettings::default()
         };
-        let lens = settings.intrinsics([1920, 1080], 270).unwrap();
-        assert!((lens.fx - 150.0).abs() < 1e-9);
-        assert!((lens.fy - 152.5).abs() < 1e-9);
-        assert!((lens.cx - 134.5).abs() < 1e-9 && (lens.cy - 134.5).abs() < 1e-9);
+        let intrinsics = settings.intrinsics([1920, 1080], 270).unwrap();
+        assert!((intrinsics.fx - 150.0).abs() < 1e-9);
+        assert!((intrinsics.fy - 152.5).abs() < 1e-9);
+        assert!((intrinsics.cx - 134.5).abs() < 1e-9 && (intrinsics.cy - 134.5).abs() < 1e-9);
         // The same picture at half the size has the same camera.
-        assert_eq!(settings.intrinsics([960, 540], 270).unwrap(), lens);
+        assert_eq!(settings.intrinsics([960, 540], 270).unwrap(), intrinsics);
         assert!(matches!(
             settings.intrinsics([1080, 1920], 270),
-            Err(LensError::Shape { .. })
+            Err(CameraError::Shape { .. })
         ));
     }
 
@@ -193,24 +193,24 @@ mod tests {
     fn up_is_up_and_no_up_is_level() {
         let looking_down = 0.4_f64;
         let up = [0.0, -looking_down.cos(), -looking_down.sin()];
-        let settings = LensSettings {
+        let settings = CameraSettings {
             up: Some(up),
-            ..LensSettings::default()
+            ..CameraSettings::default()
         };
         let pose = settings.first_pose().unwrap();
         assert!((pose * Vector3::from(up) - Vector3::z()).norm() < 1e-12);
         let forward = pose * Vector3::z();
         assert!((forward.z + looking_down.sin()).abs() < 1e-12);
-        let level = LensSettings {
+        let level = CameraSettings {
             up: Some([0.0, -1.0, 0.0]),
-            ..LensSettings::default()
+            ..CameraSettings::default()
         };
         let difference = level.first_pose().unwrap().inv_mul(&level_camera());
         assert!(difference.rotation.angle() < 1e-9);
-        let sideways = LensSettings {
+        let sideways = CameraSettings {
             up: Some([1.0, 0.0, 0.0]),
-            ..LensSettings::default()
+            ..CameraSettings::default()
         };
-        assert_eq!(sideways.first_pose(), Err(LensError::Up));
+        assert_eq!(sideways.first_pose(), Err(CameraError::Up));
     }
 }

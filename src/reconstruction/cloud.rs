@@ -7,11 +7,11 @@ use nalgebra::Point3;
 use ndarray::{ArrayView2, ArrayView3};
 
 /// Points of one frame on every `stride`-th cell of its depth, in rows from the top left. `depth` `[h, w]` and `rgb`
-/// `[H, W, 3]` cover the same square image, whose intrinsics are `lens`.
+/// `[H, W, 3]` cover the same square image, whose intrinsics are `intrinsics`.
 pub fn lift(
     depth: ArrayView2<f32>,
     rgb: ArrayView3<u8>,
-    lens: &Intrinsics,
+    intrinsics: &Intrinsics,
     T_world_camera: &Rigid,
     stride: usize,
 ) -> Vec<Point> {
@@ -24,7 +24,7 @@ pub fn lift(
             if !z.is_finite() || z <= 0.0 {
                 continue;
             }
-            let [x, y] = ray(lens, [rows, columns], row, column);
+            let [x, y] = ray(intrinsics, [rows, columns], row, column);
             let p = T_world_camera * Point3::new(x * z, y * z, z);
             let at = |cell: usize, cells: usize, pixels: usize| {
                 ((cell as f64 + 0.5) / cells as f64 * pixels as f64) as usize
@@ -40,8 +40,11 @@ pub fn lift(
 }
 
 /// The ray through the centre of a cell of a `[rows, columns]` grid over the image, at unit depth.
-pub fn ray(lens: &Intrinsics, grid: [usize; 2], row: usize, column: usize) -> [f64; 2] {
-    let u = (column as f64 + 0.5) / grid[1] as f64 * f64::from(lens.width) - 0.5;
-    let v = (row as f64 + 0.5) / grid[0] as f64 * f64::from(lens.height) - 0.5;
-    [(u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy]
+pub fn ray(intrinsics: &Intrinsics, grid: [usize; 2], row: usize, column: usize) -> [f64; 2] {
+    let u = (column as f64 + 0.5) / grid[1] as f64 * f64::from(intrinsics.width) - 0.5;
+    let v = (row as f64 + 0.5) / grid[0] as f64 * f64::from(intrinsics.height) - 0.5;
+    [
+        (u - intrinsics.cx) / intrinsics.fx,
+        (v - intrinsics.cy) / intrinsics.fy,
+    ]
 }

@@ -1,8 +1,8 @@
 //! Why a recording cannot be reconstructed.
 
 use super::anchor::AnchorError;
+use super::camera::CameraError;
 use super::folder_error::FolderError;
-use super::lens::LensError;
 use super::windows::WindowError;
 use crate::formats::ReadError;
 use crate::labelling::LabelError;
@@ -52,7 +52,7 @@ pub enum ReconstructError {
     Read(#[from] ReadError),
     /// What is said of the camera cannot be used.
     #[error(transparent)]
-    Camera(#[from] LensError),
+    Camera(#[from] CameraError),
     /// The video cannot be cut into windows.
     #[error(transparent)]
     Windows(#[from] WindowError),

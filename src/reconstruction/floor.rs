@@ -126,13 +126,13 @@ pub fn floor_height(feet: &[f64], rule: FloorRule) -> Result<f64, ScaleRefusal> 
 /// A [`ScaleRefusal`] when no floor is seen, when what is seen of it does not say the scale, or when something else contradicts it.
 pub fn fit_floor(
     views: &[View<'_>],
-    lens: &Intrinsics,
+    intrinsics: &Intrinsics,
     floor: f64,
     space: DepthSpace,
     settings: &FloorFit,
 ) -> Result<DepthFit, ScaleRefusal> {
     shows_something(views)?;
-    let cloud = Cloud::new(views, lens, floor, space);
+    let cloud = Cloud::new(views, intrinsics, floor, space);
     if cloud.total < 100 {
         return Err(ScaleRefusal::TooFewPoints { found: cloud.total });
     }
@@ -164,8 +164,8 @@ pub fn fit_floor(
     };
     bounded(&fit, &cloud, settings)?;
     cloud.windows_agree(&line, settings)?;
-    hands_agree(views, lens, &fit)?;
-    if let Some(factor) = other_scale(views, lens, &fit) {
+    hands_agree(views, intrinsics, &fit)?;
+    if let Some(factor) = other_scale(views, intrinsics, &fit) {
         return Err(ScaleRefusal::Parallax { factor });
     }
     Ok(fit)
@@ -224,7 +224,7 @@ const TRIALS: u64 = 300;
 const SHARPEST: f64 = 0.005;
 
 impl Cloud {
-    fn new(views: &[View<'_>], lens: &Intrinsics, floor: f64, space: DepthSpace) -> Self {
+    fn new(views: &[View<'_>], intrinsics: &Intrinsics, floor: f64, space: DepthSpace) -> Self {
         let (mut points, mut depths, mut total) = (Vec::new(), Vec::new(), 0);
         for view in views {
             let grid = [view.depth.nrows(), view.depth.ncols()];
@@ -238,7 +238,7 @@ impl Cloud {
                     depths.push(depth);
                 }
                 total += 1;
-                let [x, y] = ray(lens, grid, row, column);
+                let [x, y] = ray(intrinsics, grid, row, column);
                 let rise = (view.T_world_camera.rotation * Vector3::new(x, y, 1.0)).z;
                 let distance = height / -rise;
                 if rise < -LEAST_FALL && distance > 0.0 && distance < FARTHEST {
@@ -443,7 +443,11 @@ fn bounded(fit: &DepthFit, cloud: &Cloud, settings: &FloorFit) -> Result<(), Sca
 }
 
 /// Whether the depth at the wearer's hands is that of the hands, where they are in view.
-fn hands_agree(views: &[View<'_>], lens: &Intrinsics, fit: &DepthFit) -> Result<(), ScaleRefusal> {
+fn hands_agree(
+    views: &[View<'_>],
+    intrinsics: &Intrinsics,
+    fit: &DepthFit,
+) -> Result<(), ScaleRefusal> {
     let mut ratios = Vec::new();
     for view in views {
         let (rows, columns) = view.depth.dim();
@@ -454,8 +458,16 @@ fn hands_agree(views: &[View<'_>], lens: &Intrinsics, fit: &DepthFit) -> Result<
             let cell = |at: f64, pixels: u32, cells: usize| {
                 ((at + 0.5) / f64::from(pixels) * cells as f64).floor() as isize
             };
-            let column = cell(lens.fx * x / z + lens.cx, lens.width, columns);
-            let row = cell(lens.fy * y / z + lens.cy, lens.height, rows);
+            let column = cell(
+                intrinsics.fx * x / z + intrinsics.cx,
+                intrinsics.width,
+                columns,
+            );
+            let row = cell(
+                intrinsics.fy * y / z + intrinsics.cy,
+                intrinsics.height,
+                rows,
+            );
             let (Ok(row), Ok(column)) = (usize::try_from(row), usize::try_from(column)) else {
                 continue;
             };

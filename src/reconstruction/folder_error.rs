@@ -1,13 +1,13 @@
-//! Why a reconstruction folder cannot be written.
+//! Why a reconstruction folder cannot be written or read.
 
 use crate::formats::FormatError;
 use crate::view::ViewError;
 use std::path::{Path, PathBuf};
 
-/// Why a reconstruction folder cannot be written.
+/// Why a reconstruction folder cannot be written or read.
 #[derive(Debug, thiserror::Error)]
 pub enum FolderError {
-    /// A file or a folder cannot be made or written.
+    /// A file or a folder cannot be made, written or read.
     #[error("{path}: {error}")]
     Io {
         /// The file or folder.
@@ -22,8 +22,8 @@ pub enum FolderError {
     /// The page cannot be made, or a video frame cannot be stored for it.
     #[error(transparent)]
     View(#[from] ViewError),
-    /// The manifest cannot be put into JSON.
-    #[error("{0}")]
+    /// The manifest cannot be put into JSON, or is damaged.
+    #[error("manifest: {0}")]
     Manifest(#[from] serde_json::Error),
 }
 

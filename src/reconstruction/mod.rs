@@ -2,11 +2,12 @@
 //! (Sec. 4.1, Supp. D).
 //!
 //! [`reconstruct()`] is the whole: read [`mod@reconstruct`] (the loop), [`recording`] (what it reads), [`result`] (what it gives).
-//! Its parts are [`lens`] (the camera, given or assumed), [`windows`] (how a video is cut), [`mod@track`], [`stitch`] and [`depth`] (how windows become one), [`scale`] and [`floor`] (metric depth from the
+//! Its parts are [`camera`] (the camera, given or assumed), [`windows`] (how a video is cut), [`mod@track`], [`stitch`] and [`depth`] (how windows become one), [`scale`] and [`floor`] (metric depth from the
 //! floor or from another model), [`predictions`] (decoded signals of single clips, for evaluation), then [`export`] (files for
 //! other programs) and [`overlay`] (the wearer drawn into the video), [`dataset`] (pictures with cameras, for view synthesis).
 
 pub mod anchor;
+pub mod camera;
 pub mod cloud;
 pub mod dataset;
 pub mod depth;
@@ -17,7 +18,6 @@ mod floor_view;
 pub mod folder;
 mod folder_error;
 pub mod frame_buffer;
-pub mod lens;
 pub mod overlay;
 mod parallax;
 mod picture;

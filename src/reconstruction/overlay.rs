@@ -58,10 +58,7 @@ impl Overlay {
             path: folder.to_owned(),
             reason,
         };
-        let text =
-            std::fs::read(folder.join("manifest.json")).map_err(|e| refuse(e.to_string()))?;
-        let manifest: Manifest =
-            serde_json::from_slice(&text).map_err(|e| refuse(e.to_string()))?;
+        let manifest = Manifest::read(folder).map_err(|e| refuse(e.to_string()))?;
         let has = |file: &str| manifest.files.iter().any(|name| name == file);
         let arrays = |file: &str| {
             if has(file) {

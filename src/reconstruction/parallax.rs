@@ -19,7 +19,11 @@ const FRAMES: usize = 10;
 const CAP: f64 = 0.3;
 
 /// The factor that explains the parallax clearly better than the fit, if there is one.
-pub(super) fn other_scale(views: &[View<'_>], lens: &Intrinsics, fit: &DepthFit) -> Option<f64> {
+pub(super) fn other_scale(
+    views: &[View<'_>],
+    intrinsics: &Intrinsics,
+    fit: &DepthFit,
+) -> Option<f64> {
     let step = views.len().div_ceil(FRAMES).max(1);
     let frames: Vec<(Array2<f32>, Isometry3<f64>)> = views
         .iter()
@@ -35,10 +39,10 @@ pub(super) fn other_scale(views: &[View<'_>], lens: &Intrinsics, fit: &DepthFit)
                 continue;
             }
             for (row, column) in cells(from.dim()) {
-                let [x, y] = ray(lens, [from.nrows(), from.ncols()], row, column);
+                let [x, y] = ray(intrinsics, [from.nrows(), from.ncols()], row, column);
                 let z = f64::from(from[[row, column]]);
-                let errors =
-                    FACTORS.map(|factor| mismatch(to, lens, &T_b_a, [x, y], z * factor, factor));
+                let errors = FACTORS
+                    .map(|factor| mismatch(to, intrinsics, &T_b_a, [x, y], z * factor, factor));
                 // Only points that all factors put into the other picture compare them.
                 if z.is_finite() && errors.iter().all(Option::is_some) {
                     for (cost, error) in costs.iter_mut().zip(errors) {
@@ -68,7 +72,7 @@ fn cells((rows, columns): (usize, usize)) -> impl Iterator<Item = (usize, usize)
 /// How far, in the logarithm of depth, a point of one frame is from what the other frame shows there.
 fn mismatch(
     to: &Array2<f32>,
-    lens: &Intrinsics,
+    intrinsics: &Intrinsics,
     T_b_a: &Isometry3<f64>,
     [x, y]: [f64; 2],
     z: f64,
@@ -82,8 +86,16 @@ fn mismatch(
         let cell = (at + 0.5) / f64::from(pixels) * cells as f64;
         (cell >= 0.0 && cell < cells as f64).then_some(cell as usize)
     };
-    let column = cell(lens.fx * p.x / p.z + lens.cx, lens.width, to.ncols())?;
-    let row = cell(lens.fy * p.y / p.z + lens.cy, lens.height, to.nrows())?;
+    let column = cell(
+        intrinsics.fx * p.x / p.z + intrinsics.cx,
+        intrinsics.width,
+        to.ncols(),
+    )?;
+    let row = cell(
+        intrinsics.fy * p.y / p.z + intrinsics.cy,
+        intrinsics.height,
+        to.nrows(),
+    )?;
     let seen = f64::from(to[[row, column]]) * factor;
     seen.is_finite().then(|| (seen / p.z).ln().abs().min(CAP))
 }

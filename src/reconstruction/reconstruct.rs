@@ -1,11 +1,11 @@
 //! The loop: window by window from frames to a [`Reconstruction`] (Sec. 4.1, Supp. C and D).
 
 use super::anchor;
+use super::camera::CameraSettings;
 use super::error::ReconstructError;
 use super::floor::FloorFit;
 use super::folder::Builder;
 use super::frame_buffer::DepthFrames;
-use super::lens::LensSettings;
 use super::recording::{Recording, SYNTHETIC};
 use super::result::{Reconstruction, ReconstructionInfo};
 use super::stitch::follows_camera;
@@ -40,7 +40,7 @@ pub struct ReconstructOptions {
     /// Seconds that neighbouring windows of two seconds have in common: 0.5, 1 or 1.5.
     pub overlap: f64,
     /// The camera, as far as it is known.
-    pub camera: LensSettings,
+    pub camera: CameraSettings,
     /// How depth becomes metric from the floor.
     pub floor: FloorFit,
     /// Metric depth instead of the floor.
@@ -70,7 +70,7 @@ impl Default for ReconstructOptions {
             decoding: DecodingSettings::default(),
             decoding_name: "default".to_owned(),
             overlap: 1.0,
-            camera: LensSettings::default(),
+            camera: CameraSettings::default(),
             floor: FloorFit::default(),
             anchor: None,
             seed: 0,

@@ -1,8 +1,8 @@
 //! What is reconstructed: a video, or a stored clip with its truth.
 
 use super::anchor;
+use super::camera::CameraSettings;
 use super::error::ReconstructError;
-use super::lens::LensSettings;
 use super::windows::Window;
 use crate::clip::{Clip, Intrinsics, RGB, Rgb};
 use crate::geometry::rigid::Rigid;
@@ -67,7 +67,7 @@ impl Recording {
     pub fn of_video(
         video: Video,
         [start, limit]: [Option<f64>; 2],
-        camera: &LensSettings,
+        camera: &CameraSettings,
         format: &ClipFormat,
     ) -> Result<Self, ReconstructError> {
         let start = start.unwrap_or(0.0);
@@ -156,7 +156,7 @@ impl Recording {
     /// When it has no colour video, or what is said of its camera cannot be.
     pub fn of_clip(
         mut clip: Clip,
-        camera: &LensSettings,
+        camera: &CameraSettings,
         format: &ClipFormat,
     ) -> Result<Self, ReconstructError> {
         let rgb = clip.take(RGB).ok_or_else(|| ReconstructError::NoColour {
@@ -330,28 +330,33 @@ fn fact(label: &str, value: impl Display) -> Fact {
     }
 }
 
-fn words(lens: &Intrinsics) -> String {
+fn words(intrinsics: &Intrinsics) -> String {
     format!(
         "fx {:.2}, fy {:.2}, cx {:.2}, cy {:.2} at {} x {}",
-        lens.fx, lens.fy, lens.cx, lens.cy, lens.width, lens.height
+        intrinsics.fx,
+        intrinsics.fy,
+        intrinsics.cx,
+        intrinsics.cy,
+        intrinsics.width,
+        intrinsics.height
     )
 }
 
 /// What the settings say of the camera, and what is assumed instead.
-fn said(settings: &LensSettings, lens: &Intrinsics) -> [Fact; 2] {
+fn said(settings: &CameraSettings, intrinsics: &Intrinsics) -> [Fact; 2] {
     let from = match settings.calibration {
-        Some(_) => "from `lens.calibration`".to_owned(),
+        Some(_) => "from `camera.calibration`".to_owned(),
         None => format!(
-            "ASSUMED: {} degrees across the square (`lens.field_of_view`, `lens.calibration`)",
+            "ASSUMED: {} degrees across the square (`camera.field_of_view`, `camera.calibration`)",
             settings.field_of_view
         ),
     };
     let up = match settings.up {
-        Some(_) => "from `lens.up`".to_owned(),
-        None => "ASSUMED: the first camera is level (`lens.up`)".to_owned(),
+        Some(_) => "from `camera.up`".to_owned(),
+        None => "ASSUMED: the first camera is level (`camera.up`)".to_owned(),
     };
     [
-        fact("Intrinsics", format_args!("{}, {from}", words(lens))),
+        fact("Intrinsics", format_args!("{}, {from}", words(intrinsics))),
         fact("Up", up),
     ]
 }

@@ -28,18 +28,25 @@ pub struct Moment<'a> {
 }
 
 /// Draws a moment into a square frame, whose camera has these intrinsics at whatever size.
-pub fn draw(canvas: &mut Canvas, lens: &Intrinsics, moment: &Moment<'_>) {
+pub fn draw(canvas: &mut Canvas, intrinsics: &Intrinsics, moment: &Moment<'_>) {
     let side = canvas.size().0 as f64;
     let weight = side / 480.0;
     if let (Some(body), Some(pose)) = (moment.body, moment.T_world_camera) {
         let inverse = pose.inverse();
         let joints = body.map(|p| inverse * Point3::from(p.map(f64::from)));
-        skeleton(canvas, lens, &BODY, &joints, 4.0 * weight, BODY_COLOUR);
+        skeleton(
+            canvas,
+            intrinsics,
+            &BODY,
+            &joints,
+            4.0 * weight,
+            BODY_COLOUR,
+        );
     }
     for (hand, colour) in moment.hands.into_iter().zip([LEFT, RIGHT]) {
         if let Some(hand) = hand {
             let joints = hand.map(|p| Point3::from(p.map(f64::from)));
-            skeleton(canvas, lens, &HAND, &joints, 2.5 * weight, colour);
+            skeleton(canvas, intrinsics, &HAND, &joints, 2.5 * weight, colour);
         }
     }
     if let Some(gaze) = moment
@@ -56,7 +63,7 @@ pub fn draw(canvas: &mut Canvas, lens: &Intrinsics, moment: &Moment<'_>) {
 /// Bones, dark below, so that they stand out on any picture; each is cut where it passes the camera.
 fn skeleton(
     canvas: &mut Canvas,
-    lens: &Intrinsics,
+    intrinsics: &Intrinsics,
     skeleton: &Skeleton,
     joints: &[Point3<f64>],
     thickness: f64,
@@ -66,7 +73,7 @@ fn skeleton(
     let seen: Vec<[[f64; 2]; 2]> = skeleton
         .bones()
         .filter_map(|(a, b)| before(joints[a], joints[b]))
-        .map(|ends| ends.map(|p| project(lens, side, p)))
+        .map(|ends| ends.map(|p| project(intrinsics, side, p)))
         .collect();
     for [from, to] in &seen {
         canvas.line(*from, *to, thickness + 0.5 * thickness, SHADE);
@@ -92,9 +99,11 @@ fn before(a: Point3<f64>, b: Point3<f64>) -> Option<[Point3<f64>; 2]> {
 }
 
 /// Where a point before the camera is seen, in pixels of a square of this side.
-fn project(lens: &Intrinsics, side: f64, p: Point3<f64>) -> [f64; 2] {
-    let u = (lens.fx * p.x / p.z + lens.cx + 0.5) / f64::from(lens.width) * side - 0.5;
-    let v = (lens.fy * p.y / p.z + lens.cy + 0.5) / f64::from(lens.height) * side - 0.5;
+fn project(intrinsics: &Intrinsics, side: f64, p: Point3<f64>) -> [f64; 2] {
+    let u = (intrinsics.fx * p.x / p.z + intrinsics.cx + 0.5) / f64::from(intrinsics.width) * side
+        - 0.5;
+    let v = (intrinsics.fy * p.y / p.z + intrinsics.cy + 0.5) / f64::from(intrinsics.height) * side
+        - 0.5;
     [u, v]
 }
 

@@ -25,8 +25,8 @@ const DEPTH_UNIT: f32 = 0.001;
 pub fn write_page(scene: &Scene, out: &mut impl Write) -> Result<(), ViewError> {
     scene.check()?;
     let cloud = quantise(&scene.cloud);
-    let lens = &scene.intrinsics;
-    let (width, height) = (f64::from(lens.width), f64::from(lens.height));
+    let intrinsics = &scene.intrinsics;
+    let (width, height) = (f64::from(intrinsics.width), f64::from(intrinsics.height));
     let manifest = json!({
         "title": scene.title,
         "badges": scene.badges.iter().map(|b| json!({"text": b.text, "kind": match b.tone {
@@ -36,7 +36,7 @@ pub fn write_page(scene: &Scene, out: &mut impl Write) -> Result<(), ViewError> 
         "samples": scene.samples,
         "floor": scene.floor,
         // Focal length and centre as shares of the image, whose corners are (0, 0) and (1, 1).
-        "lens": [lens.fx / width, lens.fy / height, (lens.cx + 0.5) / width, (lens.cy + 0.5) / height],
+        "lens": [intrinsics.fx / width, intrinsics.fy / height, (intrinsics.cx + 0.5) / width, (intrinsics.cy + 0.5) / height],
         "video": scene.video.as_ref().map(|v| json!({
             "rate": v.rate, "count": v.len(), "offsets": v.offsets() })),
         "depth": scene.depth.as_ref().map(|d| json!({

@@ -9,8 +9,8 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 use reviv::geometry::rigid::Rigid;
 use reviv::geometry::skeleton::{BODY, HAND, JOINTS, Joints};
+use reviv::reconstruction::camera::CameraSettings;
 use reviv::reconstruction::frame_buffer::DepthFrames;
-use reviv::reconstruction::lens::LensSettings;
 use reviv::reconstruction::stitch::Tracks;
 use reviv::reconstruction::tracks::SignalTrack;
 use reviv::reconstruction::{
@@ -229,7 +229,7 @@ pub fn reconstruct(
     samples: usize,
     progress: Option<Py<PyAny>>,
 ) -> PyResult<Reconstruction> {
-    let mut camera = LensSettings::default();
+    let mut camera = CameraSettings::default();
     if let Some(degrees) = field_of_view {
         camera.field_of_view = degrees;
     }

@@ -115,7 +115,7 @@ fn options(settings: &ReconstructSettings, seed: u64) -> ReconstructOptions {
         decoding: settings.decoding.settings.clone(),
         decoding_name: settings.decoding.name.clone(),
         overlap: settings.overlap,
-        camera: settings.lens,
+        camera: settings.camera,
         floor: settings.floor.clone(),
         anchor: match (&settings.anchor, &settings.anchor_model) {
             (Some(path), _) => Some(Anchor::Maps(path.0.clone().into())),
@@ -166,7 +166,7 @@ fn failed(error: ReconstructError) -> StageError {
             "check the file, or convert it with `ffmpeg`"
         }
         ReconstructError::NoCameraPath { .. } => "add `camera` to `targets`",
-        ReconstructError::Camera(_) => "correct `lens`",
+        ReconstructError::Camera(_) => "correct `camera`",
         ReconstructError::Windows(_) => "choose another `overlap`",
         ReconstructError::Anchor(_) => "see `anchor` in `reviv show reconstruct`",
         ReconstructError::AnchorModel(_) => {

@@ -38,19 +38,23 @@ pub fn write_tum(rate: f64, camera: &[Rigid], out: &mut impl Write) -> std::io::
 ///
 /// # Errors
 /// When writing fails.
-pub fn write_colmap(folder: &Path, camera: &[Rigid], lens: &Intrinsics) -> std::io::Result<()> {
+pub fn write_colmap(
+    folder: &Path,
+    camera: &[Rigid],
+    intrinsics: &Intrinsics,
+) -> std::io::Result<()> {
     std::fs::create_dir_all(folder)?;
     let mut cameras = std::fs::File::create(folder.join("cameras.txt"))?;
     writeln!(cameras, "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]")?;
     writeln!(
         cameras,
         "1 PINHOLE {} {} {} {} {} {}",
-        lens.width,
-        lens.height,
-        lens.fx,
-        lens.fy,
-        lens.cx + 0.5,
-        lens.cy + 0.5
+        intrinsics.width,
+        intrinsics.height,
+        intrinsics.fx,
+        intrinsics.fy,
+        intrinsics.cx + 0.5,
+        intrinsics.cy + 0.5
     )?;
     let mut images = std::io::BufWriter::new(std::fs::File::create(folder.join("images.txt"))?);
     writeln!(
@@ -112,7 +116,7 @@ mod tests {
     fn colmap_images_are_world_to_camera() {
         let folder = tempfile::tempdir().unwrap();
         let pose = Rigid::new(Vector3::new(1.0, 2.0, 3.0), Vector3::new(0.1, -0.2, 0.5));
-        let lens = Intrinsics {
+        let intrinsics = Intrinsics {
             fx: 128.0,
             fy: 128.0,
             cx: 127.5,
@@ -120,7 +124,7 @@ mod tests {
             width: 256,
             height: 256,
         };
-        write_colmap(folder.path(), &[pose], &lens).unwrap();
+        write_colmap(folder.path(), &[pose], &intrinsics).unwrap();
         let text = std::fs::read_to_string(folder.path().join("images.txt")).unwrap();
         let fields: Vec<&str> = text.lines().nth(2).unwrap().split(' ').collect();
         let n: Vec<f64> = fields[1..8].iter().map(|v| v.parse().unwrap()).collect();

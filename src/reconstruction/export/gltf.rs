@@ -31,7 +31,7 @@ pub struct Camera<'a> {
     /// `T_world_camera` per sample.
     pub poses: &'a [Rigid],
     /// Of the square picture.
-    pub lens: &'a Intrinsics,
+    pub intrinsics: &'a Intrinsics,
 }
 
 const FLOAT: u32 = 5126;
@@ -277,12 +277,12 @@ impl Glb {
     }
 
     fn camera(&mut self, camera: &Camera<'_>) {
-        let lens = camera.lens;
-        let height = f64::from(lens.height);
-        let angle = 2.0 * (height / 2.0 / lens.fy).atan();
+        let intrinsics = camera.intrinsics;
+        let height = f64::from(intrinsics.height);
+        let angle = 2.0 * (height / 2.0 / intrinsics.fy).atan();
         self.cameras.push(json!({
             "type": "perspective",
-            "perspective": {"yfov": angle, "aspectRatio": f64::from(lens.width) / height, "znear": 0.05},
+            "perspective": {"yfov": angle, "aspectRatio": f64::from(intrinsics.width) / height, "znear": 0.05},
         }));
         // glTF's camera looks along -z with y up; ours along z with y down.
         let up = from_z_up();

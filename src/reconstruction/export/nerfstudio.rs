@@ -19,10 +19,15 @@ pub fn picture(index: usize) -> String {
 
 /// The data set of pictures of `side` pixels at these poses; `points` names a point cloud in the same world.
 #[must_use]
-pub fn transforms(cameras: &[Rigid], lens: &Intrinsics, side: u32, points: Option<&str>) -> Value {
+pub fn transforms(
+    cameras: &[Rigid],
+    intrinsics: &Intrinsics,
+    side: u32,
+    points: Option<&str>,
+) -> Value {
     let (x, y) = (
-        f64::from(side) / f64::from(lens.width),
-        f64::from(side) / f64::from(lens.height),
+        f64::from(side) / f64::from(intrinsics.width),
+        f64::from(side) / f64::from(intrinsics.height),
     );
     let turn = UnitQuaternion::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI);
     let frame = |(index, T_world_camera): (usize, &Rigid)| {
@@ -34,10 +39,10 @@ pub fn transforms(cameras: &[Rigid], lens: &Intrinsics, side: u32, points: Optio
         "camera_model": "OPENCV",
         "w": side,
         "h": side,
-        "fl_x": lens.fx * x,
-        "fl_y": lens.fy * y,
-        "cx": (lens.cx + 0.5) * x,
-        "cy": (lens.cy + 0.5) * y,
+        "fl_x": intrinsics.fx * x,
+        "fl_y": intrinsics.fy * y,
+        "cx": (intrinsics.cx + 0.5) * x,
+        "cy": (intrinsics.cy + 0.5) * y,
         "k1": 0.0,
         "k2": 0.0,
         "p1": 0.0,
@@ -58,7 +63,7 @@ mod tests {
 
     #[test]
     fn the_camera_looks_along_minus_z_and_the_middle_is_half_the_size() {
-        let lens = Intrinsics {
+        let intrinsics = Intrinsics {
             fx: 32.0,
             fy: 32.0,
             cx: 31.5,
@@ -67,7 +72,7 @@ mod tests {
             height: 64,
         };
         let pose = Rigid::new(Vector3::new(1.0, 2.0, 3.0), Vector3::new(0.0, 0.0, 0.5));
-        let data = transforms(&[pose], &lens, 512, Some("points.ply"));
+        let data = transforms(&[pose], &intrinsics, 512, Some("points.ply"));
         assert_eq!(
             (data["cx"].as_f64(), data["fl_x"].as_f64()),
             (Some(256.0), Some(256.0))

@@ -79,7 +79,7 @@ impl Reconstruction {
         }
         let camera = Camera {
             poses: cameras,
-            lens: &self.info.intrinsics,
+            intrinsics: &self.info.intrinsics,
         };
         write_file(path, "scene.glb", &mut manifest.files, |out| {
             write_glb(SIGNAL_RATE, &wearers, Some(&camera), out).map_err(FolderError::io(path))

@@ -41,7 +41,10 @@ pub const PAGE: &str = "view.html";
 const GRID: usize = 64;
 /// Points of the whole recording in `points.ply` and in the fits, at most.
 const POINTS: usize = 2_000_000;
-/// What `manifest.json` of the folder holds.
+/// The file of the folder that says what is in it.
+pub const MANIFEST: &str = "manifest.json";
+
+/// What [`MANIFEST`] holds.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Manifest {
     /// The name of the recording.
@@ -71,6 +74,18 @@ pub struct Manifest {
     pub confidence: BTreeMap<String, f64>,
     /// The files of the folder, this one included, relative to it and sorted.
     pub files: Vec<String>,
+}
+
+impl Manifest {
+    /// The manifest of a folder that [`Reconstruction::write`] made.
+    ///
+    /// # Errors
+    /// When there is none, or it is damaged.
+    pub fn read(folder: &Path) -> Result<Self, FolderError> {
+        let path = folder.join(MANIFEST);
+        let text = std::fs::read(&path).map_err(FolderError::io(&path))?;
+        Ok(serde_json::from_slice(&text)?)
+    }
 }
 
 /// Builds a reconstruction window by window.
@@ -278,8 +293,8 @@ impl Builder {
             Some(coding) if coding.depth_kind == DepthKind::Disparity => DepthSpace::Disparity,
             _ => DepthSpace::Depth,
         };
-        let lens = &self.info.intrinsics;
-        fit_floor(&views, lens, floor, space, &self.info.floor_fit)
+        let intrinsics = &self.info.intrinsics;
+        fit_floor(&views, intrinsics, floor, space, &self.info.floor_fit)
     }
 
     fn fit_to_anchor(&self, anchor: &Array3<f32>) -> Result<DepthFit, ScaleRefusal> {
@@ -376,10 +391,10 @@ impl Reconstruction {
         self.write_points(path, &mut manifest)?;
         write_file(path, PAGE, &mut manifest.files, |out| self.write_view(out))?;
         self.write_depth(path, &mut manifest)?;
-        manifest.files.push("manifest.json".into());
+        manifest.files.push(MANIFEST.into());
         manifest.files.sort();
         let json = serde_json::to_vec_pretty(&manifest)?;
-        write_file(path, "manifest.json", &mut Vec::new(), |out| {
+        write_file(path, MANIFEST, &mut Vec::new(), |out| {
             out.write_all(&json).map_err(FolderError::io(path))
         })?;
         Ok(manifest)
