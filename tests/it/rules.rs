@@ -373,3 +373,33 @@ fn the_map_of_the_paper_has_every_room_of_science_and_every_quoted_section() {
     }
     assert!(missing.is_empty(), "{}", missing.join("\n"));
 }
+
+/// What the paper has: sections, equations, its algorithm, the tables whose numbers are known, and the supplement.
+const PAPER: [&str; 19] = [
+    "Sec. 3", "Sec. 3.1", "Sec. 3.2", "Sec. 4.1", "Sec. 4.2", "Sec. 4.3", "Sec. 5", "Eq. 1",
+    "Eq. 2", "Eq. 3", "Alg. 1", "Table 1", "Table 2", "Supp. A", "Supp. B", "Supp. C", "Supp. D",
+    "Supp. E", "Supp. F",
+];
+
+#[test]
+fn the_map_of_the_paper_has_a_row_or_a_heading_for_each_of_its_items() {
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let page = std::fs::read_to_string(root.join("docs/paper.md")).unwrap();
+    // A heading, the line above a table, or the first cell of a row.
+    let mut places: Vec<String> = Vec::new();
+    for line in page.lines() {
+        let place = match line.strip_prefix("| ") {
+            Some(row) => row.split(" |").next().unwrap_or_default(),
+            None if line.starts_with('#') || line.ends_with(':') => line,
+            None => continue,
+        };
+        places.extend(quoted(place));
+    }
+    let missing = |items: &[String], from: &[String]| -> Vec<String> {
+        let absent = items.iter().filter(|item| !from.contains(item));
+        absent.cloned().collect()
+    };
+    let paper: Vec<String> = PAPER.map(str::to_owned).to_vec();
+    assert_eq!(missing(&paper, &places), [""; 0], "no row");
+    assert_eq!(missing(&places, &paper), [""; 0], "not of the paper");
+}
