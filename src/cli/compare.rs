@@ -14,7 +14,6 @@ use crate::geometry::alignment::Freedom;
 use crate::run::Cache;
 use crate::run::RunDirectory;
 use crate::run::cache::Key;
-use crate::run::files::read_json;
 use crate::run::schedule::Schedule;
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -122,8 +121,7 @@ fn level(text: &str) -> Result<f64, String> {
 
 /// Published rows by the name of their entry, as a file in `path` sees it.
 pub(super) fn published(catalog: &Catalog, path: &Path, name: &str) -> Option<Published> {
-    let value = load::entry(catalog, path, "published", name)?;
-    serde_json::from_value(value).ok()
+    load::entry(catalog, path, name)
 }
 
 impl Compare {
@@ -205,17 +203,15 @@ fn numbers(errors: &TrajectoryErrors) -> serde_json::Value {
     })
 }
 
+fn scores(path: &Path) -> Result<Scores, Failure> {
+    Scores::read(path)
+        .map_err(|error| Failure::input(error.to_string(), "was it written by `op: evaluate`?"))
+}
+
 /// The rows that `name` stands for: a scores file, a folder with one, or a run.
-///
-/// Stages of a run that score nothing of `columns` are left out, if another of its stages does: a table of depth has no row
-/// for scores of hands, which may be of other clips.
 pub fn entrants_of(path: &Path, runs: &Path, columns: &[String]) -> Result<Vec<Method>, Failure> {
-    let read = |path: &Path| {
-        Scores::read(path)
-            .map_err(|error| Failure::input(error.to_string(), "was it written by `op: evaluate`?"))
-    };
     if path.is_file() || path.join(FILE).is_file() {
-        let scores = read(path)?;
+        let scores = scores(path)?;
         return Ok(vec![Method {
             label: scores.system.clone(),
             seeds: vec![scores],
@@ -223,8 +219,19 @@ pub fn entrants_of(path: &Path, runs: &Path, columns: &[String]) -> Result<Vec<M
     }
     let run =
         RunDirectory::named(runs, path).map_err(|error| Failure::input(error.to_string(), ""))?;
-    let schedule: Schedule = read_json(&run.path().join("plan.json"))
-        .map_err(|error| Failure::input(error.to_string(), ""))?;
+    let schedule = Schedule::read(&run).map_err(|error| Failure::input(error.to_string(), ""))?;
+    rows_of(&run, &schedule, columns)
+}
+
+/// The rows of a run, by what it was planned to do.
+///
+/// Stages of a run that score nothing of `columns` are left out, if another of its stages does: a table of depth has no row
+/// for scores of hands, which may be of other clips.
+pub fn rows_of(
+    run: &RunDirectory,
+    schedule: &Schedule,
+    columns: &[String],
+) -> Result<Vec<Method>, Failure> {
     let cache = Cache::of(run.runs());
     let is_scores = |key| {
         schedule
@@ -241,7 +248,7 @@ pub fn entrants_of(path: &Path, runs: &Path, columns: &[String]) -> Result<Vec<M
         }
         let folder = cache.path(key);
         if folder.join(FILE).is_file() {
-            found.insert(*key, read(&folder)?);
+            found.insert(*key, scores(&folder)?);
         } else {
             missing += 1;
         }

@@ -23,7 +23,6 @@ use crate::experiment::{files, load};
 use crate::formats::text::of_path;
 use crate::ops::clips::SourceSettings;
 use crate::video::DecoderChoice;
-use serde::Deserialize as _;
 use std::fmt::Write as _;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
@@ -158,16 +157,10 @@ fn source_entry(name: &str) -> Result<SourceSettings, Failure> {
             format!("registry sources: {names}"),
         ));
     };
-    let Some(settings) = load::entry(&catalog, here, "source", name) else {
-        return Err(Failure::input(
+    load::entry(&catalog, here, name).ok_or_else(|| {
+        Failure::input(
             format!("the registry source `{name}` has mistakes"),
             format!("`reviv check {}` shows them", text.place),
-        ));
-    };
-    SourceSettings::deserialize(settings).map_err(|error| {
-        Failure::input(
-            format!("the registry source `{name}`: {error}"),
-            format!("`reviv show source/{name}` shows its settings"),
         )
     })
 }

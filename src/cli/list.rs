@@ -40,10 +40,14 @@ impl super::Run for List {
         let mut lines = Vec::new();
         let wanted = |kind: &str| self.kind.as_deref().is_none_or(|wanted| wanted == kind);
         if wanted("ops") {
-            lines.extend(catalog.ops().iter().map(|op| Line {
+            let ops = catalog.ops().iter().map(|op| (op.name(), op.about()));
+            let groups = catalog.groups().iter().map(|it| (it.name, it.about));
+            let mut ops: Vec<(&str, &str)> = ops.chain(groups).collect();
+            ops.sort_unstable();
+            lines.extend(ops.into_iter().map(|(name, about)| Line {
                 kind: "ops".to_owned(),
-                name: op.name().to_owned(),
-                about: op.about().to_owned(),
+                name: name.to_owned(),
+                about: about.to_owned(),
                 place: String::new(),
             }));
         }

@@ -89,7 +89,7 @@ impl History {
     pub fn of(runs: &Path, machine: &Machine) -> Self {
         let mut history = Self::default();
         for run in RunDirectory::all(runs).unwrap_or_default() {
-            let Ok(schedule) = files::read_json::<Schedule>(&run.path().join("plan.json")) else {
+            let Ok(schedule) = Schedule::read(&run) else {
                 continue;
             };
             for work in &schedule.works {
@@ -105,7 +105,7 @@ impl History {
                     of_op.push(record.seconds / ideal);
                 }
                 if let Some(units) = work.plan["work"][0].as_f64().filter(|n| *n > 0.0) {
-                    let key = kind(&work.op, &work.settings);
+                    let key = kind(&work.op, work.settings.json());
                     let of_kind = history.by_work.entry(key).or_default();
                     of_kind.push(record.seconds / units);
                 }

@@ -45,7 +45,7 @@ impl super::Run for Plan {
         let history = History::of(&self.runs, &machine);
         for stage in &mut planned.stages {
             let (flop, units) = (stage.plan.flop, stage.plan.work.as_ref().map(|work| work.0));
-            let took = history.seconds(&machine, stage.op, &stage.settings, flop, units);
+            let took = history.seconds(&machine, stage.op, stage.settings.json(), flop, units);
             stage.plan.seconds = stage.plan.seconds.or(took);
         }
         for (path, number) in &outside.unread {

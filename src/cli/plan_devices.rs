@@ -118,7 +118,7 @@ fn planned(experiment: &Experiment, stage: &PlannedStage, devices: f64) -> Optio
         .stages
         .iter()
         .find(|own| own.name == stage.name)?;
-    let settings = &own.settings;
+    let settings = own.settings.json();
     let training = Training {
         parameters: plan.parameters? as f64,
         steps: *steps as f64,

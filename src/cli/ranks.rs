@@ -70,7 +70,8 @@ impl Identity {
         let schedule = Schedule::of(experiment, prints).map_err(|error| error.to_string())?;
         let (mut settings, mut data) = (blake3::Hasher::new(), blake3::Hasher::new());
         for work in &schedule.works {
-            settings.update(format!("{} {} {}\n", work.op, work.seed, work.settings).as_bytes());
+            let own = work.settings.json();
+            settings.update(format!("{} {} {own}\n", work.op, work.seed).as_bytes());
             for file in &work.files {
                 data.update(format!("{} {}\n", file.key, file.blake3).as_bytes());
             }

@@ -7,15 +7,14 @@ use super::terminal::{Failure, Terminal};
 use crate::engine::DeviceChoice;
 use crate::experiment::catalog::Catalog;
 use crate::experiment::load::Request;
+use crate::ops::ReconstructSettings;
 use crate::reconstruction::dataset::write_nerfstudio;
-use crate::reconstruction::folder::{FOLDER, Manifest, PAGE};
+use crate::reconstruction::folder::{FOLDER, MANIFEST, Manifest, PAGE};
 use crate::reconstruction::overlay::{Overlay, OverlayError};
 use crate::reconstruction::predictions::ScaleStatus;
 use crate::run::execute::{Job, Outcome, execute};
 use crate::run::schedule::Schedule;
-use crate::run::{
-    Cache, Interrupt, RunDirectory, RunError, Shard, State, WorkerPool, files, metrics,
-};
+use crate::run::{Cache, Interrupt, RunDirectory, RunError, Shard, State, WorkerPool, files};
 use crate::video::{DecoderChoice, Video, VideoSettings};
 use crate::view::movie;
 use std::fmt::Write as _;
@@ -25,8 +24,6 @@ use std::path::{Path, PathBuf};
 const EXPERIMENT: &str = include_str!("../../experiments/reconstruct.yaml");
 const FILE: &str = "experiments/reconstruct.yaml";
 const STAGE: &str = "reconstruction";
-/// What lists the files of a result.
-const MANIFEST: &str = "manifest.json";
 /// The video with what was reconstructed drawn in: by `ffmpeg`, or without.
 const OVERLAYS: [&str; 2] = ["overlay.mp4", "overlay.avi"];
 /// The folder of a data set for NerfStudio.
@@ -140,9 +137,11 @@ impl super::Run for Reconstruct {
                 format!("`{FILE}` names it so"),
             )
         })?;
-        publish(&artifact.join(FOLDER), &target).map_err(|error| tell(terminal, &error))?;
+        let made = artifact.join(FOLDER);
+        let manifest = Manifest::read(&made).map_err(Failure::machine)?;
+        publish(&made, &target).map_err(|error| tell(terminal, &error))?;
         self.write_more(terminal, &outcome, &target)?;
-        Self::report(terminal, &outcome, &target)
+        Self::report(terminal, &outcome, &manifest, &target)
     }
 }
 
@@ -245,9 +244,12 @@ impl Reconstruct {
     }
 
     /// What was made, what was assumed, and where the time went.
-    fn report(terminal: &Terminal, outcome: &Outcome, target: &Path) -> Result<(), Failure> {
-        let manifest: Manifest =
-            files::read_json(&target.join(MANIFEST)).map_err(|e| tell(terminal, &e))?;
+    fn report(
+        terminal: &Terminal,
+        outcome: &Outcome,
+        manifest: &Manifest,
+        target: &Path,
+    ) -> Result<(), Failure> {
         let mut text = String::from("\n");
         for [label, value] in &manifest.assumptions {
             let _ = writeln!(text, "{label:<12}{value}");
@@ -258,8 +260,7 @@ impl Reconstruct {
         if let Some(reason) = &manifest.refused {
             let _ = writeln!(text, "{:<12}no metric scale: {reason}", "");
         }
-        let stage = outcome.run.path().join("stages").join(STAGE);
-        if let Ok(rows) = metrics::read(&stage)
+        if let Ok(rows) = outcome.metrics(STAGE)
             && let Some(row) = rows.last()
         {
             text.push('\n');
@@ -370,7 +371,7 @@ pub fn find_model(runs: &Path, given: Option<&Path>) -> Result<PathBuf, RunError
 
 /// What a run made, or used, of this kind (`mget`, `clips`, `tokens`): the last one of its plan that is in the cache.
 pub fn artifact_of(run: &RunDirectory, kind: &str) -> Option<PathBuf> {
-    let schedule: Schedule = files::read_json(&run.path().join("plan.json")).ok()?;
+    let schedule = Schedule::read(run).ok()?;
     let cache = Cache::of(run.runs());
     let made = schedule.works.iter().rev().filter(|work| work.kind == kind);
     made.filter(|work| cache.contains(&work.key))
@@ -380,13 +381,12 @@ pub fn artifact_of(run: &RunDirectory, kind: &str) -> Option<PathBuf> {
 
 /// How the stage read the video.
 fn reading(outcome: &Outcome) -> VideoSettings {
-    let schedule: Option<Schedule> = files::read_json(&outcome.run.path().join("plan.json")).ok();
-    let works = schedule.into_iter().flat_map(|schedule| schedule.works);
-    let mut stages = works.filter(|work| work.stage == STAGE);
-    let settings = stages.next().map(|work| work.settings["reading"].clone());
-    settings
-        .and_then(|settings| serde_json::from_value(settings).ok())
-        .unwrap_or_default()
+    let settings = outcome.settings(STAGE);
+    let reading = settings.and_then(|own| {
+        own.with(|own: &ReconstructSettings| own.reading.clone())
+            .ok()
+    });
+    reading.unwrap_or_default()
 }
 
 fn finished(terminal: &Terminal, outcome: &Outcome, interrupt: &Interrupt) -> Result<(), Failure> {
@@ -411,7 +411,7 @@ fn earlier(target: &Path) -> Option<Vec<PathBuf>> {
     if std::fs::read_dir(target).ok()?.next().is_none() {
         return Some(Vec::new());
     }
-    let manifest: Manifest = files::read_json(&target.join(MANIFEST)).ok()?;
+    let manifest = Manifest::read(target).ok()?;
     let own = |file: &PathBuf| {
         file == Path::new(MANIFEST)
             || file.starts_with(NERFSTUDIO)

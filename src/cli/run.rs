@@ -112,7 +112,7 @@ impl Run {
         };
         let outcome = execute(&job).map_err(|error| tell(terminal, &error))?;
         if let (State::Done, Some(compare)) = (outcome.state, &experiment.compare) {
-            let table = sweep_table::write(catalog, experiment, compare, &outcome.run)?;
+            let table = sweep_table::write(catalog, experiment, compare, &outcome)?;
             terminal.note(format_args!("\n{table}\n"));
         }
         finish(terminal, &outcome, &interrupt)

@@ -36,19 +36,16 @@ impl super::Run for Show {
         let mut found = false;
         let mut values = Vec::new();
         let mut text = String::new();
-        if let Some(op) = catalog.op(&name) {
+        let group = catalog.group(&name);
+        if let Some(op) = group.map_or_else(|| catalog.op(&name), |group| Some(group.op)) {
             found = true;
             let settings = catalog
                 .schema(op.name())
                 .map(|schema| docs::settings(&catalog, schema))
                 .unwrap_or_default();
-            let _ = writeln!(
-                text,
-                "op {} (version {})\n{}\n",
-                op.name(),
-                op.version(),
-                op.about()
-            );
+            let shown = group.map_or_else(|| op.name(), |group| group.name);
+            let about = group.map_or_else(|| op.about(), |group| group.about);
+            let _ = writeln!(text, "op {shown} (version {})\n{about}\n", op.version());
             for port in op.inputs() {
                 let kinds: Vec<&str> = port.kinds.iter().map(|kind| kind.name()).collect();
                 let _ = writeln!(
@@ -59,11 +56,21 @@ impl super::Run for Show {
                     port.about
                 );
             }
+            if let Some(group) = group {
+                let (map, one) = (group.members, op.name());
+                let _ = writeln!(
+                    text,
+                    "  `{map}` is a map: each entry is a stage of `{one}` whose `{}` is the key.\n  Inputs and \
+                     settings stand in an entry, or beside `{map}` for all of them.",
+                    group.setting
+                );
+            }
             let _ = writeln!(text, "  makes {}\n", op.output());
             table(&mut text, &settings);
             values.push(json!({
-                "op": op.name(), "version": op.version(), "about": op.about(),
+                "op": shown, "version": op.version(), "about": about,
                 "makes": op.output(), "settings": settings,
+                "members": group.map(|group| group.members),
             }));
         }
         for entry in registry.list(None) {
@@ -144,6 +151,7 @@ impl super::Run for Show {
             let all = registry.list(None);
             let mut known: Vec<&str> = all.iter().map(|entry| entry.name.as_str()).collect();
             known.extend(catalog.ops().iter().map(|op| op.name()));
+            known.extend(catalog.groups().iter().map(|group| group.name));
             return Err(Failure::input(
                 format!("there is no op, registry entry, run or file `{name}`"),
                 crate::experiment::nearest(&name, known.into_iter()).map_or_else(

@@ -1,7 +1,7 @@
 //! The `compare:` block of a sweep: `report/table.{md,tex,csv}`, `report/table_intervals.svg` and, in words,
 //! `report/conclusion.md` of its run, which the run's page shows.
 
-use super::compare::{entrants_of, published};
+use super::compare::{published, rows_of};
 use super::terminal::Failure;
 use crate::evaluation::compare::{CompareSettings, IntervalSettings, compare};
 use crate::evaluation::conclusion::conclusion;
@@ -11,16 +11,18 @@ use crate::evaluation::statistics::Over;
 use crate::experiment::catalog::Catalog;
 use crate::experiment::graph::Resample;
 use crate::experiment::{Compare, Experiment};
-use crate::run::{RunDirectory, files, report};
+use crate::run::execute::Outcome;
+use crate::run::{files, report};
 
 /// Writes the table of a finished sweep and its page anew. Gives the table for the terminal.
 pub fn write(
     catalog: &Catalog,
     experiment: &Experiment,
     asked: &Compare,
-    run: &RunDirectory,
+    outcome: &Outcome,
 ) -> Result<String, Failure> {
-    let entrants = entrants_of(run.path(), run.runs(), &asked.columns)?;
+    let run = &outcome.run;
+    let entrants = rows_of(run, &outcome.schedule, &asked.columns)?;
     let against = asked.against.as_ref();
     let published = against.and_then(|name| published(catalog, &experiment.path, name));
     let over = asked.interval.over.iter().map(|what| match what {

@@ -4,7 +4,7 @@ use super::run::{RunsDir, find, tell};
 use super::terminal::{Failure, Terminal};
 use crate::reconstruction::folder::{FOLDER, PAGE};
 use crate::run::schedule::Schedule;
-use crate::run::{Cache, RunDirectory, files};
+use crate::run::{Cache, RunDirectory};
 use std::path::{Path, PathBuf};
 
 /// Open the page of a reconstruction: one HTML file that needs no network and no server
@@ -71,8 +71,7 @@ impl View {
         if self.report {
             return Ok(vec![report_of(&run)?]);
         }
-        let schedule: Schedule = files::read_json(&run.path().join("plan.json"))
-            .map_err(|error| tell(terminal, &error))?;
+        let schedule = Schedule::read(&run).map_err(|error| tell(terminal, &error))?;
         let cache = Cache::of(run.runs());
         let pages: Vec<PathBuf> = schedule
             .works

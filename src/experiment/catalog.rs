@@ -1,7 +1,8 @@
 //! Everything that is linked into the binary: ops, kinds of entries, built-in entries and experiments.
 
 use super::entry::{KindEntry, LinkedEntry};
-use super::stage::{AnyOp, OpEntry};
+use super::settings::Settings;
+use super::stage::{AnyOp, GroupEntry, OpEntry};
 use schemars::generate::{SchemaGenerator, SchemaSettings};
 use serde_json::Value;
 use std::collections::BTreeMap;
@@ -9,6 +10,7 @@ use std::collections::BTreeMap;
 /// Ops, kinds and entries under one look-up, with the schemas of their settings.
 pub struct Catalog {
     ops: Vec<&'static dyn AnyOp>,
+    groups: Vec<&'static GroupEntry>,
     kinds: Vec<KindFacts>,
     schemas: BTreeMap<&'static str, Value>,
     definitions: Value,
@@ -27,7 +29,7 @@ pub struct KindFacts {
     /// Schema of the settings.
     pub schema: Value,
     /// Settings with every default filled in; fails where they do not fit the schema.
-    pub normalize: fn(Value) -> Result<Value, serde_json::Error>,
+    pub parse: fn(Value) -> Result<Settings, serde_json::Error>,
 }
 
 /// An entry before it is parsed.
@@ -62,12 +64,21 @@ impl Catalog {
             place: format!("{} (linked in)", entry.origin),
             text: entry.text.into(),
         }));
-        Self::new(ops, kinds, entries, embedded::EXPERIMENTS)
+        let groups: Vec<&GroupEntry> = inventory::iter::<GroupEntry>.into_iter().collect();
+        Self::new(ops, kinds, entries, embedded::EXPERIMENTS).with_groups(&groups)
     }
 
     /// A catalog of these and nothing else, for tests.
     pub fn of(ops: &[&'static dyn AnyOp], kinds: &[&KindEntry], entries: Vec<EntryText>) -> Self {
         Self::new(ops.iter().copied(), kinds.iter().copied(), entries, &[])
+    }
+
+    /// With these groups, whose ops it has, instead of its own.
+    #[must_use]
+    pub fn with_groups(mut self, groups: &[&'static GroupEntry]) -> Self {
+        self.groups = groups.to_vec();
+        self.groups.sort_by_key(|group| group.name);
+        self
     }
 
     fn new<'k>(
@@ -92,7 +103,7 @@ impl Catalog {
                 kind: kind.kind,
                 about: kind.about,
                 schema: (kind.schema)(&mut generator).to_value(),
-                normalize: kind.normalize,
+                parse: kind.parse,
             })
             .collect();
         let compare = generator
@@ -103,6 +114,7 @@ impl Catalog {
         definitions.insert("compare".to_owned(), compare);
         Self {
             ops,
+            groups: Vec::new(),
             kinds,
             schemas,
             definitions: Value::Object(definitions),
@@ -119,6 +131,16 @@ impl Catalog {
     /// The op of a name.
     pub fn op(&self, name: &str) -> Option<&'static dyn AnyOp> {
         self.ops.iter().copied().find(|op| op.name() == name)
+    }
+
+    /// All ops that stand for several stages, by name.
+    pub fn groups(&self) -> &[&'static GroupEntry] {
+        &self.groups
+    }
+
+    /// The group of a name.
+    pub fn group(&self, name: &str) -> Option<&'static GroupEntry> {
+        self.groups.iter().copied().find(|group| group.name == name)
     }
 
     /// The schema of an op's settings.

@@ -5,18 +5,21 @@ use super::catalog::Catalog;
 /// Keys of a stage that mean two things, and whose: a plug-in whose op has the name of another, or whose setting has the
 /// name of an input of its own.
 pub fn clashes(catalog: &Catalog) -> Vec<String> {
-    let names = catalog
-        .ops()
-        .windows(2)
-        .filter(|pair| pair[0].name() == pair[1].name())
-        .map(|pair| {
-            let name = pair[0].name();
-            format!("two ops named `{name}` are linked into this binary")
-        });
-    let mut clashes: Vec<String> = names.collect();
+    let mut names: Vec<&str> = catalog.ops().iter().map(|op| op.name()).collect();
+    names.extend(catalog.groups().iter().map(|group| group.name));
+    names.sort_unstable();
+    let twice = names.windows(2).filter(|pair| pair[0] == pair[1]);
+    let twice = twice.map(|pair| {
+        let name = pair[0];
+        format!("two ops named `{name}` are linked into this binary")
+    });
+    let mut clashes: Vec<String> = twice.collect();
     for op in catalog.ops() {
         let mut taken = vec!["op", "seed"];
         taken.extend(op.inputs().iter().map(|port| port.name));
+        let groups = catalog.groups().iter();
+        let groups = groups.filter(|group| group.op.name() == op.name());
+        taken.extend(groups.map(|group| group.members));
         let mut settings: Vec<String> = catalog
             .schema(op.name())
             .map(|schema| super::docs::settings(catalog, schema))

@@ -3,6 +3,7 @@
 //! `masking: uniform` and `masking: {use: dirichlet, alpha: 0.001}` both become an [`Entry<T>`]: the entry's name and its
 //! settings with the changes applied. `T` says of which kind it is by [`Kind`].
 
+use super::settings::Settings;
 use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::de::{DeserializeOwned, Error as _};
 use serde::ser::Error as _;
@@ -79,7 +80,7 @@ pub struct KindEntry {
     /// The schema of the settings.
     pub schema: fn(&mut SchemaGenerator) -> Schema,
     /// Settings with every default filled in; fails where they do not fit the settings struct.
-    pub normalize: fn(Value) -> Result<Value, serde_json::Error>,
+    pub parse: fn(Value) -> Result<Settings, serde_json::Error>,
 }
 
 impl KindEntry {
@@ -89,7 +90,7 @@ impl KindEntry {
             kind: T::KIND,
             about: T::ABOUT,
             schema: |generator| generator.subschema_for::<T>(),
-            normalize: |value| serde_json::to_value(serde_json::from_value::<T>(value)?),
+            parse: Settings::parse::<T>,
         }
     }
 }

@@ -2,6 +2,7 @@
 
 use super::artifact::Description;
 pub use super::compare::{Compare, Interval, Resample};
+use super::settings::Settings;
 use super::source::Sources;
 use super::stage::{AnyOp, DataInput, FileInput, InputFacts, Inputs, StagePlan};
 use super::typed::Trace;
@@ -62,8 +63,21 @@ impl Cell {
 pub struct Graph {
     /// A stage's edges refer to others by their index in this list.
     pub stages: Vec<Stage>,
+    /// Names that stand for several of them.
+    pub groups: Vec<Group>,
     /// The keys beside the stages, for `reviv why`: `experiment`, `about`, `seed`, `params.x`.
     pub head: Vec<Head>,
+}
+
+/// A name that stands for several stages, which one entry of the file makes (see [`super::GroupEntry`]).
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Group {
+    /// The key in `stages:`.
+    pub name: String,
+    /// The key of the map with an entry for each stage: `modalities`.
+    pub key: &'static str,
+    /// The names of its stages, in the order of the map: `tokenizers.rgb`.
+    pub members: Vec<String>,
 }
 
 /// A value of the experiment itself.
@@ -80,12 +94,14 @@ pub struct Head {
 /// A stage: an op with complete settings and resolved edges.
 #[derive(Clone)]
 pub struct Stage {
-    /// The key in `stages:`; a stage of another experiment keeps its `file/stage` name.
+    /// The key in `stages:`, or `group.member`; a stage of another experiment keeps its `file/stage` name.
     pub name: String,
+    /// Where its settings are written: `stages.mget`, `stages.tokenizers.modalities.rgb`.
+    pub path: String,
     /// What it does.
     pub op: &'static dyn AnyOp,
     /// Every setting, defaults filled in, registry references resolved, paths resolved.
-    pub settings: Value,
+    pub settings: Settings,
     /// The seed; ops that are not seeded ignore it.
     pub seed: u64,
     /// One per connected port, in the order of the op's ports.
@@ -162,7 +178,7 @@ impl Graph {
     ) -> std::io::Result<Vec<ArtifactKey>> {
         let mut keys: Vec<ArtifactKey> = Vec::with_capacity(self.stages.len());
         for stage in &self.stages {
-            let mut settings = stage.settings.clone();
+            let mut settings = stage.settings.json().clone();
             let mut hasher = blake3::Hasher::new();
             let mut part = |bytes: &[u8]| {
                 hasher.update(&(bytes.len() as u64).to_le_bytes());

@@ -5,11 +5,13 @@ use super::clashes::clashes;
 use super::compose::Composer;
 use super::data;
 use super::diagnostic::{Diagnostic, Report, Span};
+use super::entry::Kind;
 use super::files::{beside, canonical, read};
 use super::graph::{Cell, Experiment};
 use super::problem::Code;
 use super::registry::Registry;
 use super::resolve::Resolver;
+use super::settings::Settings;
 use super::source::{Origin, Source, Sources};
 use super::sweep;
 use super::typed::Validator;
@@ -107,9 +109,10 @@ fn registry_of(entry: &Path) -> Option<PathBuf> {
         .or_else(|| above(&canonical(entry)))
 }
 
-/// The settings of a registry entry, complete, as an experiment in `path` sees it; `None` where it has mistakes.
-pub fn entry(catalog: &Catalog, path: &Path, kind: &str, name: &str) -> Option<serde_json::Value> {
-    let facts = catalog.kind(kind)?;
+/// The settings of a registry entry, complete, as an experiment in `path` sees it; `None` where there is none, and where it has
+/// mistakes.
+pub fn entry<T: Kind + Clone>(catalog: &Catalog, path: &Path, name: &str) -> Option<T> {
+    let facts = catalog.kind(T::KIND)?;
     let mut report = Report::default();
     let mut registry = Registry::new(catalog, beside(path, "registry").as_deref());
     let layer = report.sources.add(Source {
@@ -119,7 +122,8 @@ pub fn entry(catalog: &Catalog, path: &Path, kind: &str, name: &str) -> Option<s
         origin: Origin::File,
     });
     let asked = Span::point(layer, 0);
-    entry_settings(catalog, &mut registry, facts, name, asked, &mut report)
+    let settings = entry_settings(catalog, &mut registry, facts, name, asked, &mut report)?;
+    settings.with(T::clone).ok()
 }
 
 /// The settings of an entry, every default filled in; `None` after a report.
@@ -130,7 +134,7 @@ fn entry_settings(
     name: &str,
     asked: Span,
     report: &mut Report,
-) -> Option<serde_json::Value> {
+) -> Option<Settings> {
     let (sources, diagnostics) = (&mut report.sources, &mut report.diagnostics);
     let node = registry.settings(kind.kind, name, asked, sources, diagnostics)?;
     let mut typer = Validator {
@@ -143,7 +147,7 @@ fn entry_settings(
         prefix: String::new(),
     };
     let value = typer.value(&kind.schema, &node, "")?;
-    (kind.normalize)(value)
+    (kind.parse)(value)
         .map_err(|error| {
             let refused = Diagnostic::new(Code::E0202, asked, error.to_string());
             report.diagnostics.push(refused);

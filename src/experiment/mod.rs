@@ -4,6 +4,7 @@
 //! One file in `ops/`: a settings struct, a unit struct that implements [`Op`], and `inventory::submit! { OpEntry(&It) }`.
 //! The language does the rest: it parses, merges layers, resolves registry references and paths, fills defaults, checks
 //! keys, types and ranges against the schema of the settings, resolves the edges and checks their artifact kinds.
+//! An op that stands for several stages of another one is a [`GroupEntry`].
 
 pub mod artifact;
 pub mod catalog;
@@ -18,6 +19,7 @@ pub mod entry;
 mod external_inputs;
 pub mod files;
 pub mod graph;
+mod group;
 mod interpolate;
 pub mod load;
 pub mod merge;
@@ -30,6 +32,7 @@ mod resolve;
 pub mod resolved;
 pub mod scaling;
 pub mod schema;
+mod settings;
 pub mod source;
 pub mod stage;
 mod sweep;
@@ -40,10 +43,12 @@ pub mod yaml;
 pub use artifact::{ArtifactKind, Description, SignalFacts, TokenFacts};
 pub use context::{InputArtifact, StageContext, StageError};
 pub use entry::{Entry, Kind, KindEntry, LinkedEntry};
-pub use graph::{ArtifactKey, Cell, Compare, Edge, Experiment, Graph, Interval, Stage};
+pub use graph::{ArtifactKey, Cell, Compare, Edge, Experiment, Graph, Group, Interval, Stage};
 pub use names::{nearest, suggest};
 pub use path::FilePath;
 pub use problem::{Code, Problem};
+pub use settings::Settings;
 pub use stage::{
-    AnyOp, Arity, DataInput, FileInput, InputFacts, Inputs, Op, OpEntry, Port, StagePlan, TokenPlan,
+    AnyOp, Arity, DataInput, FileInput, GroupEntry, InputFacts, Inputs, Op, OpEntry, Port,
+    StagePlan, TokenPlan,
 };

@@ -2,9 +2,9 @@
 
 use super::artifact::{ArtifactKind, Description, TokenFacts};
 use super::graph::{ArtifactKey, Experiment, Graph, Stage};
+use super::settings::Settings;
 use super::stage::StagePlan;
 use serde::Serialize;
-use serde_json::Value;
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -53,7 +53,7 @@ pub struct PlannedStage {
     pub description: Description,
     /// Resolved.
     #[serde(skip)]
-    pub settings: Value,
+    pub settings: Settings,
     /// Shapes, parameters, memory and FLOP, as far as they are known.
     pub plan: StagePlan,
 }
@@ -166,5 +166,5 @@ fn question(graph: &Graph, stage: &Stage) -> String {
         (edge.port, descriptions)
     });
     let edges: Vec<_> = edges.collect();
-    serde_json::json!([stage.op.name(), stage.settings, edges]).to_string()
+    serde_json::json!([stage.op.name(), stage.settings.json(), edges]).to_string()
 }

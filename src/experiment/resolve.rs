@@ -11,16 +11,17 @@ use super::data::DataRoot;
 use super::diagnostic::{Diagnostic, Span};
 use super::external_inputs;
 use super::graph::{Edge, Graph, Stage};
+use super::group;
 use super::interpolate::interpolate;
 use super::problem::{Code, Problem};
 use super::registry::Registry;
+use super::settings::Settings;
 use super::source::{Origin, Sources};
 use super::stage::{AnyOp, Port};
 use super::sweep;
 use super::typed::Trace;
 use super::why;
 use super::yaml::{Data, Node};
-use serde_json::Value;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
@@ -46,11 +47,12 @@ pub struct Resolver<'a> {
 /// A stage while it is put together.
 struct Draft {
     name: String,
+    path: String,
     key_span: Span,
     span: Span,
     op: &'static dyn AnyOp,
     op_span: Span,
-    settings: Option<Value>,
+    settings: Option<Settings>,
     traces: BTreeMap<String, Trace>,
     seed: u64,
     edges: Vec<(&'static Port, Vec<Target>)>,
@@ -98,19 +100,23 @@ impl Resolver<'_> {
             return None;
         }
         let items = stages.map(Node::items).unwrap_or_default();
+        let opened = group::open(self.catalog, items, self.diagnostics);
+        let written = opened.stages;
         let mut graph = Graph {
+            groups: opened.groups,
             head: why::heads(&root),
             ..Graph::default()
         };
         let mut places = BTreeMap::new();
         let mut drafts: Vec<Option<Draft>> = Vec::new();
-        for item in items {
-            drafts.push(self.draft(item, items, seed, &mut graph, &mut places));
+        for stage in &written {
+            drafts.push(self.draft(stage, &written, seed, &mut graph, &mut places));
         }
         for draft in drafts.iter_mut().flatten() {
             for (_, targets) in &mut draft.edges {
                 for target in targets {
-                    if let Some(index) = items.iter().position(|item| item.key == target.name) {
+                    let mut names = written.iter().map(|stage| &stage.item.key);
+                    if let Some(index) = names.position(|name| *name == target.name) {
                         target.to = To::Local(index);
                     }
                 }
@@ -166,6 +172,7 @@ impl Resolver<'_> {
         let settings = draft.settings?;
         let mut stage = Stage {
             name: draft.name,
+            path: draft.path,
             op: draft.op,
             files: draft.op.files(&settings),
             data: external_inputs::data(

@@ -53,7 +53,7 @@ fn stage_to_yaml(experiment: &Experiment, cell: &Cell, stage: &Stage) -> String 
             &mut text, experiment, stage, 4, edge.port, &value, edge.port,
         );
     }
-    if let Value::Object(map) = &stage.settings {
+    if let Value::Object(map) = stage.settings.json() {
         for (key, value) in map {
             emit(&mut text, experiment, stage, 4, key, value, key);
         }

@@ -5,7 +5,7 @@
 use super::catalog::Catalog;
 use super::graph::Compare;
 use super::registry::Registry;
-use super::stage::Arity;
+use super::stage::{AnyOp, Arity};
 use serde_json::{Map, Value, json};
 
 /// The schema as text, as `registry/schema.json` holds it.
@@ -187,52 +187,71 @@ impl Editor<'_> {
     }
 
     fn stage(&self) -> Value {
-        let ops: Vec<Value> = self
-            .catalog
-            .ops()
-            .iter()
-            .map(|op| json!({ "const": op.name(), "description": op.about() }))
+        let catalog = self.catalog;
+        let named = |name: &str, about: &str| json!({ "const": name, "description": about });
+        let ops = catalog.ops().iter().map(|op| named(op.name(), op.about()));
+        let groups = catalog.groups().iter();
+        let ops: Vec<Value> = ops
+            .chain(groups.map(|group| named(group.name, group.about)))
             .collect();
-        let rules: Vec<Value> = self
-            .catalog
-            .ops()
-            .iter()
-            .map(|op| {
-                let mut properties = Map::new();
-                properties.insert("op".to_owned(), json!({ "const": op.name() }));
-                properties.insert("seed".to_owned(), seed());
-                for port in op.inputs() {
-                    let kinds: Vec<&str> = port.kinds.iter().map(|kind| kind.name()).collect();
-                    let about = format!("{} ({})", port.about, kinds.join(" or "));
-                    let form = match port.arity {
-                        Arity::Many | Arity::Any => json!({
-                            "type": "array", "items": {"type": "string"}, "description": about,
-                        }),
-                        Arity::OneOrMore => json!({
-                            "anyOf": [{"type": "string"}, {"type": "array", "items": {"type": "string"}}],
-                            "description": about,
-                        }),
-                        Arity::One => json!({ "type": "string", "description": about }),
-                        Arity::Optional => {
-                            json!({ "type": ["string", "null"], "description": about })
-                        }
-                    };
-                    properties.insert(port.name.to_owned(), form);
-                }
-                if let Some(schema) = self.catalog.schema(op.name()) {
-                    self.properties(schema, &mut properties);
-                }
-                json!({
-                    "if": { "properties": { "op": { "const": op.name() } }, "required": ["op"] },
-                    "then": { "properties": properties, "additionalProperties": false },
-                })
+        let rule = |name: &str, mut properties: Map<String, Value>| {
+            properties.insert("op".to_owned(), json!({ "const": name }));
+            json!({
+                "if": { "properties": { "op": { "const": name } }, "required": ["op"] },
+                "then": { "properties": properties, "additionalProperties": false },
             })
-            .collect();
+        };
+        let single = catalog.ops().iter();
+        let mut rules: Vec<Value> = single.map(|op| rule(op.name(), self.op(*op))).collect();
+        for group in catalog.groups() {
+            let mut shared = self.op(group.op);
+            shared.remove(group.setting);
+            let member = json!({
+                "type": ["object", "null"], "properties": shared, "additionalProperties": false,
+            });
+            shared.insert(
+                group.members.to_owned(),
+                json!({
+                    "type": "object",
+                    "description": format!("A stage of `{}` for each; what stands beside this holds for all", group.op.name()),
+                    "additionalProperties": member,
+                }),
+            );
+            rules.push(rule(group.name, shared));
+        }
         json!({
             "type": "object",
             "properties": { "op": { "oneOf": ops, "description": "What the stage does" } },
             "allOf": rules,
         })
+    }
+
+    /// What may stand in a stage of an op, but for `op` itself.
+    fn op(&self, op: &dyn AnyOp) -> Map<String, Value> {
+        let mut properties = Map::new();
+        properties.insert("seed".to_owned(), seed());
+        for port in op.inputs() {
+            let kinds: Vec<&str> = port.kinds.iter().map(|kind| kind.name()).collect();
+            let about = format!("{} ({})", port.about, kinds.join(" or "));
+            let form = match port.arity {
+                Arity::Many | Arity::Any => json!({
+                    "type": "array", "items": {"type": "string"}, "description": about,
+                }),
+                Arity::OneOrMore => json!({
+                    "anyOf": [{"type": "string"}, {"type": "array", "items": {"type": "string"}}],
+                    "description": about,
+                }),
+                Arity::One => json!({ "type": "string", "description": about }),
+                Arity::Optional => {
+                    json!({ "type": ["string", "null"], "description": about })
+                }
+            };
+            properties.insert(port.name.to_owned(), form);
+        }
+        if let Some(schema) = self.catalog.schema(op.name()) {
+            self.properties(schema, &mut properties);
+        }
+        properties
     }
 
     fn experiment(&self) -> Value {

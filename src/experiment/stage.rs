@@ -7,9 +7,10 @@
 use super::artifact::{ArtifactKind, Description};
 use super::context::{StageContext, StageError};
 use super::problem::Problem;
+use super::settings::Settings;
 use schemars::{JsonSchema, Schema, SchemaGenerator};
+use serde::Serialize;
 use serde::de::DeserializeOwned;
-use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::path::PathBuf;
 
@@ -20,9 +21,9 @@ pub enum Arity {
     One,
     /// One or none.
     Optional,
-    /// A list of at least one: `tokenizers: [tok_body, tok_camera]`.
+    /// A list of at least one: `tokens: [tokens_adt, tokens_taco]`.
     Many,
-    /// One, or a list of at least one: `clips: nymeria` or `clips: [nymeria, egoexo]`.
+    /// One, a group or a list of at least one: `clips: nymeria`, `tokenizers: tokenizers` or `clips: [nymeria, egoexo]`.
     OneOrMore,
     /// A list that may be empty or absent.
     Any,
@@ -153,7 +154,7 @@ pub trait Op: Send + Sync + 'static {
     /// The settings beside `op:` and the ports: `#[serde(deny_unknown_fields, default)]`, doc comments on every field
     /// (they are what `reviv list` and the editor show), `#[schemars(range(min = 1))]` for bounds.
     /// [`super::entry::Entry<T>`] is a registry reference, [`super::path::FilePath`] a file.
-    type Settings: Serialize + DeserializeOwned + JsonSchema;
+    type Settings: Serialize + DeserializeOwned + JsonSchema + Send + Sync + 'static;
 
     /// The name after `op:`.
     fn name(&self) -> &'static str;
@@ -242,31 +243,31 @@ pub trait AnyOp: Send + Sync + 'static {
     fn together(&self) -> bool;
     /// The schema of the settings, without `op` and the ports.
     fn schema(&self, generator: &mut SchemaGenerator) -> Schema;
-    /// Settings with every default filled in.
-    fn normalize(&self, settings: Value) -> Result<Value, serde_json::Error>;
+    /// Settings with every default filled in, typed for this op.
+    ///
+    /// # Errors
+    /// When they do not fit the settings struct.
+    fn parse(&self, settings: Value) -> Result<Settings, serde_json::Error>;
     /// [`Op::files`]; none where the settings do not fit.
-    fn files(&self, settings: &Value) -> Vec<FileInput>;
+    fn files(&self, settings: &Settings) -> Vec<FileInput>;
     /// [`Op::data`]: names of data sets, each with the settings key that asks for it; none where the settings do not fit.
-    fn data(&self, settings: &Value) -> Vec<(String, String)>;
+    fn data(&self, settings: &Settings) -> Vec<(String, String)>;
     /// [`Op::optional_data`], as [`AnyOp::data`] gives it; none where the settings do not fit.
-    fn optional_data(&self, settings: &Value) -> Vec<(String, String)>;
+    fn optional_data(&self, settings: &Settings) -> Vec<(String, String)>;
     /// [`Op::check`]; `None`, and nothing reported, where the settings do not fit.
     fn check(
         &self,
-        settings: &Value,
+        settings: &Settings,
         inputs: &Inputs<'_>,
         problems: &mut Vec<Problem>,
     ) -> Option<Description>;
     /// [`Op::plan`]; empty where the settings do not fit.
-    fn plan(&self, settings: &Value, inputs: &Inputs<'_>, seed: u64) -> StagePlan;
+    fn plan(&self, settings: &Settings, inputs: &Inputs<'_>, seed: u64) -> StagePlan;
     /// [`Op::explain_panic`].
     fn explain_panic(&self, text: &str) -> Option<StageError>;
     /// [`Op::run`]; fails before any work where the settings do not fit.
-    fn run(&self, settings: &Value, context: &mut dyn StageContext) -> Result<Value, StageError>;
-}
-
-fn typed<O: Op>(settings: &Value) -> Result<O::Settings, serde_json::Error> {
-    O::Settings::deserialize(settings)
+    fn run(&self, settings: &Settings, context: &mut dyn StageContext)
+    -> Result<Value, StageError>;
 }
 
 impl<O: Op> AnyOp for O {
@@ -294,32 +295,36 @@ impl<O: Op> AnyOp for O {
     fn schema(&self, generator: &mut SchemaGenerator) -> Schema {
         generator.subschema_for::<O::Settings>()
     }
-    fn normalize(&self, settings: Value) -> Result<Value, serde_json::Error> {
-        serde_json::to_value(serde_json::from_value::<O::Settings>(settings)?)
+    fn parse(&self, settings: Value) -> Result<Settings, serde_json::Error> {
+        Settings::parse::<O::Settings>(settings)
     }
-    fn files(&self, settings: &Value) -> Vec<FileInput> {
-        typed::<O>(settings).map_or_else(|_| Vec::new(), |s| Op::files(self, &s))
+    fn files(&self, settings: &Settings) -> Vec<FileInput> {
+        settings
+            .with(|own: &O::Settings| Op::files(self, own))
+            .unwrap_or_default()
     }
-    fn data(&self, settings: &Value) -> Vec<(String, String)> {
-        typed::<O>(settings).map_or_else(|_| Vec::new(), |s| Op::data(self, &s))
+    fn data(&self, settings: &Settings) -> Vec<(String, String)> {
+        settings
+            .with(|own: &O::Settings| Op::data(self, own))
+            .unwrap_or_default()
     }
-    fn optional_data(&self, settings: &Value) -> Vec<(String, String)> {
-        typed::<O>(settings).map_or_else(|_| Vec::new(), |s| Op::optional_data(self, &s))
+    fn optional_data(&self, settings: &Settings) -> Vec<(String, String)> {
+        let data = settings.with(|own: &O::Settings| Op::optional_data(self, own));
+        data.unwrap_or_default()
     }
     fn check(
         &self,
-        settings: &Value,
+        settings: &Settings,
         inputs: &Inputs<'_>,
         problems: &mut Vec<Problem>,
     ) -> Option<Description> {
-        let settings = typed::<O>(settings).ok()?;
-        Some(Op::check(self, &settings, inputs, problems))
+        settings
+            .with(|own: &O::Settings| Op::check(self, own, inputs, problems))
+            .ok()
     }
-    fn plan(&self, settings: &Value, inputs: &Inputs<'_>, seed: u64) -> StagePlan {
-        typed::<O>(settings).map_or_else(
-            |_| StagePlan::default(),
-            |s| Op::plan(self, &s, inputs, seed),
-        )
+    fn plan(&self, settings: &Settings, inputs: &Inputs<'_>, seed: u64) -> StagePlan {
+        let plan = settings.with(|own: &O::Settings| Op::plan(self, own, inputs, seed));
+        plan.unwrap_or_default()
     }
     fn explain_panic(&self, text: &str) -> Option<StageError> {
         Op::explain_panic(self, text)
@@ -335,3 +340,21 @@ impl<O: Op> AnyOp for O {
 pub struct OpEntry(pub &'static dyn AnyOp);
 
 inventory::collect!(OpEntry);
+
+/// A name after `op:` that stands for several stages of one op: `inventory::submit! { GroupEntry { ... } }`.
+///
+/// What stands beside the map holds for all of them; what stands in an entry of the map is a layer over it.
+pub struct GroupEntry {
+    /// The name after `op:`.
+    pub name: &'static str,
+    /// One line for `reviv list ops`.
+    pub about: &'static str,
+    /// What each of the stages does.
+    pub op: &'static dyn AnyOp,
+    /// The key of the map with an entry for each stage.
+    pub members: &'static str,
+    /// The setting of the op that the key of an entry is the value of.
+    pub setting: &'static str,
+}
+
+inventory::collect!(GroupEntry);

@@ -3,7 +3,7 @@
 use super::catalog::Catalog;
 use super::diagnostic::Span;
 use super::docs;
-use super::graph::{Cell, Experiment, Head, Stage};
+use super::graph::{Cell, Experiment, Graph, Head, Stage};
 use super::names;
 use super::source::Origin;
 use super::typed::Trace;
@@ -64,26 +64,64 @@ pub fn explain(
         return Ok(answers);
     }
     let short = key.strip_prefix("stages.").unwrap_or(key);
-    let stage = cell
-        .graph
-        .stages
-        .iter()
-        .filter(|stage| {
-            short
-                .strip_prefix(&stage.name)
-                .is_some_and(|rest| rest.is_empty() || rest.starts_with('.'))
-        })
-        .max_by_key(|stage| stage.name.len());
-    let Some(stage) = stage else {
+    let stages = stages_of(&cell.graph, short);
+    if stages.is_empty() {
         let mut known: Vec<&str> = cell.graph.stages.iter().map(|s| s.name.as_str()).collect();
+        known.extend(cell.graph.groups.iter().map(|group| group.name.as_str()));
         known.extend(["experiment", "about", "seed", "params"]);
         let wrong = short.split('.').next().unwrap_or(short);
         return Err((
             format!("`{key}` is in no stage"),
             names::suggest(wrong, &known).unwrap_or_default(),
         ));
+    }
+    let mut answers = Vec::new();
+    let mut refused = None;
+    for (stage, rest) in stages {
+        match of_stage(catalog, experiment, cell, stage, rest) {
+            Ok(found) => answers.extend(found),
+            Err(error) => refused = refused.or(Some(error)),
+        }
+    }
+    match refused {
+        Some(error) if answers.is_empty() => Err(error),
+        _ => Ok(answers),
+    }
+}
+
+/// The stages that a key is about, each with the key inside it: one, or all of a group.
+fn stages_of<'g, 'k>(graph: &'g Graph, key: &'k str) -> Vec<(&'g Stage, &'k str)> {
+    let inside = |name: &str| {
+        let rest = key.strip_prefix(name)?;
+        let whole = rest.is_empty() || rest.starts_with('.');
+        whole.then(|| rest.trim_start_matches('.'))
     };
-    let rest = short[stage.name.len()..].trim_start_matches('.');
+    let one = graph.stages.iter().flat_map(|stage| {
+        let path = stage.path.strip_prefix("stages.").unwrap_or(&stage.path);
+        let names = [stage.name.as_str(), path].into_iter();
+        names.filter_map(move |name| Some((name.len(), stage, inside(name)?)))
+    });
+    if let Some((_, stage, rest)) = one.max_by_key(|(length, ..)| *length) {
+        return vec![(stage, rest)];
+    }
+    let groups = graph.groups.iter();
+    let found = groups.filter_map(|group| Some((group, inside(&group.name)?)));
+    let Some((group, rest)) = found.max_by_key(|(group, _)| group.name.len()) else {
+        return Vec::new();
+    };
+    let rest = if rest == group.key { "" } else { rest };
+    let stages = group.members.iter().filter_map(|name| graph.find(name));
+    stages.map(|stage| (stage, rest)).collect()
+}
+
+/// The settings of one stage below `rest`, all of them where it is empty.
+fn of_stage(
+    catalog: &Catalog,
+    experiment: &Experiment,
+    cell: &Cell,
+    stage: &Stage,
+    rest: &str,
+) -> Result<Vec<Answer>, (String, String)> {
     let mut values = values_of(cell, stage);
     if !rest.is_empty() {
         let inside = format!("{rest}.");
@@ -105,17 +143,15 @@ pub fn explain(
         .schema(stage.op.name())
         .map(|schema| docs::settings(catalog, schema))
         .unwrap_or_default();
-    Ok(values
-        .into_iter()
-        .map(|(name, value)| {
-            let about = settings
-                .iter()
-                .find(|setting| setting.key == name)
-                .map(|setting| setting.about.clone())
-                .unwrap_or_default();
-            answer(experiment, cell, stage, &name, value, about)
-        })
-        .collect())
+    let answers = values.into_iter().map(|(name, value)| {
+        let about = settings
+            .iter()
+            .find(|setting| setting.key == name)
+            .map(|setting| setting.about.clone())
+            .unwrap_or_default();
+        answer(experiment, cell, stage, &name, value, about)
+    });
+    Ok(answers.collect())
 }
 
 fn answer(
@@ -149,7 +185,7 @@ fn answer(
         });
     }
     Answer {
-        key: format!("stages.{}.{name}", stage.name),
+        key: format!("{}.{name}", stage.path),
         value,
         about,
         chain,
@@ -197,7 +233,7 @@ fn values_of(cell: &Cell, stage: &Stage) -> Vec<(String, String)> {
             .collect();
         values.push((edge.port.to_owned(), names.join(", ")));
     }
-    flatten("", &stage.settings, &mut values);
+    flatten("", stage.settings.json(), &mut values);
     values.push(("seed".to_owned(), stage.seed.to_string()));
     values
 }

@@ -17,5 +17,7 @@ pub mod tokenize;
 pub mod tokenizer_entry;
 pub mod train_mget;
 pub mod train_tokenizer;
+mod train_tokenizers;
 
+pub use reconstruct::ReconstructSettings;
 pub use tokenizer_entry::TokenizerEntry;

@@ -99,8 +99,8 @@ impl Op for Tokenize {
             Port {
                 name: "tokenizers",
                 kinds: &[ArtifactKind::Tokenizer],
-                arity: Arity::Many,
-                about: "one per modality",
+                arity: Arity::OneOrMore,
+                about: "one per modality: a stage of `train_tokenizers`, or a list",
             },
         ]
     }

@@ -7,12 +7,14 @@ use super::cache::{Cache, Entry, Key};
 use super::error::RunError;
 use super::inputs::Fingerprints;
 pub use super::job::Job;
+use super::metrics::{self, Row};
 use super::progress::duration;
 use super::record::{Owned, RunDirectory, State};
 use super::schedule::{Schedule, Task};
 use super::stage::{self, Surroundings};
 use super::worker_pool::Ended;
 use super::{gc, provenance, report};
+use crate::experiment::Settings;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicUsize, Ordering};
@@ -32,6 +34,31 @@ pub struct Outcome {
     pub failures: Vec<RunError>,
     /// Where the artifact of each stage is, of those that are made; of a sweep, that of the last arm.
     pub artifacts: BTreeMap<String, PathBuf>,
+    /// What there was to do.
+    pub schedule: Schedule,
+}
+
+impl Outcome {
+    /// The settings of a stage.
+    #[must_use]
+    pub fn settings(&self, stage: &str) -> Option<&Settings> {
+        self.work(stage).map(|work| &work.settings)
+    }
+
+    /// What a stage recorded step by step; nothing where it was made by another run.
+    ///
+    /// # Errors
+    /// When the record cannot be read.
+    pub fn metrics(&self, stage: &str) -> Result<Vec<Row>, RunError> {
+        let directory = |work: &Task| self.run.path().join("stages").join(&work.directory);
+        self.work(stage)
+            .map_or_else(|| Ok(Vec::new()), |work| metrics::read(&directory(work)))
+    }
+
+    fn work(&self, stage: &str) -> Option<&Task> {
+        let mut works = self.schedule.works.iter();
+        works.find(|work| work.stage == stage)
+    }
 }
 
 /// Where the artifacts that are made lie, by stage.
@@ -73,6 +100,7 @@ pub fn execute(job: &Job<'_>) -> Result<Outcome, RunError> {
             found,
             failures: Vec::new(),
             artifacts: artifacts(&schedule, &cache),
+            schedule,
         });
     }
 
@@ -117,6 +145,7 @@ pub fn execute(job: &Job<'_>) -> Result<Outcome, RunError> {
         found: found.saturating_sub(made),
         failures,
         artifacts: artifacts(&schedule, &cache),
+        schedule,
     })
 }
 

@@ -6,7 +6,7 @@ use super::files;
 use super::interrupt::Interrupt;
 use super::lock::{Lock, Mode};
 use super::record::{RunDirectory, State};
-use super::schedule::Schedule;
+use super::schedule::{PLAN, Schedule};
 use super::stage::StageRecord;
 use serde::Serialize;
 use std::collections::BTreeSet;
@@ -115,7 +115,7 @@ fn referred(runs: &Path) -> Result<(BTreeSet<Key>, Vec<PathBuf>), RunError> {
     let mut keys = BTreeSet::new();
     let mut checkpoints = Vec::new();
     for run in RunDirectory::all(runs)? {
-        let plan = run.path().join("plan.json");
+        let plan = run.path().join(PLAN);
         if !plan.exists() {
             if run.is_busy() {
                 return Err(RunError::Request {
@@ -126,7 +126,7 @@ fn referred(runs: &Path) -> Result<(BTreeSet<Key>, Vec<PathBuf>), RunError> {
             continue;
         }
         // A plan that cannot be read stops everything: what it refers to is not known.
-        let schedule: Schedule = files::read_json(&plan)?;
+        let schedule = Schedule::read(&run)?;
         for work in &schedule.works {
             keys.insert(work.key);
             let directory = run.path().join("stages").join(&work.directory);

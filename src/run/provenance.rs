@@ -6,7 +6,7 @@ use super::error::RunError;
 use super::files;
 use super::job::Job;
 use super::record::RunDirectory;
-use super::schedule::{FilePlan, Schedule};
+use super::schedule::{FilePlan, PLAN, Schedule};
 use crate::experiment::resolved;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -33,7 +33,7 @@ pub fn write(job: &Job<'_>, schedule: &Schedule, run: &RunDirectory) -> Result<(
     write_source(job, &environment, &run.path().join("source"))?;
     let resolved = resolved::to_yaml(job.experiment);
     files::write(&run.path().join("resolved.yaml"), resolved.as_bytes())?;
-    files::write_json(&run.path().join("plan.json"), schedule)?;
+    files::write_json(&run.path().join(PLAN), schedule)?;
     let mut files: BTreeMap<&Path, &FilePlan> = BTreeMap::new();
     for file in schedule.works.iter().flat_map(|work| &work.files) {
         files.insert(&file.path, file);

@@ -36,7 +36,7 @@ const MOST_PLOTS: usize = 60;
 /// Writes the page as the run stands now.
 pub fn write(directory: &RunDirectory) -> Result<(), RunError> {
     let run = directory.read()?;
-    let schedule: Schedule = files::read_json(&directory.path().join("plan.json"))?;
+    let schedule = Schedule::read(directory)?;
     let cache = Cache::of(directory.runs());
     let mut page = String::new();
     head(&mut page, &run, &schedule, directory);

@@ -5,13 +5,17 @@
 
 use super::cache::{Cache, Entry, Key};
 use super::error::{AtPath, RunError};
+use super::files;
 use super::inputs::Fingerprints;
-use super::record::Shard;
-use crate::experiment::{AnyOp, Experiment, Graph, OpEntry, Stage};
+use super::record::{RunDirectory, Shard};
+use crate::experiment::{AnyOp, Experiment, Graph, OpEntry, Settings, Stage};
 use serde::{Deserialize, Serialize};
 use serde_json::Value;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
+
+/// The file of a run that holds its [`Schedule`].
+pub const PLAN: &str = "plan.json";
 
 /// All work of a run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -69,7 +73,7 @@ pub struct Task {
     /// Whether the artifact depends on the seed.
     pub seeded: bool,
     /// Resolved: no reference, no default left open.
-    pub settings: Value,
+    pub settings: Settings,
     /// What it reads from other stages, in the order of the op's ports.
     pub inputs: Vec<PortPlan>,
     /// Outside files and data sets that it reads.
@@ -168,6 +172,14 @@ impl Schedule {
         })
     }
 
+    /// What a run was planned to do.
+    ///
+    /// # Errors
+    /// When its plan is not there or cannot be read.
+    pub fn read(run: &RunDirectory) -> Result<Self, RunError> {
+        files::read_json(&run.path().join(PLAN))
+    }
+
     /// The work that makes the artifact of `key`.
     pub fn work(&self, key: &Key) -> Option<&Task> {
         self.works.iter().find(|work| work.key == *key)
@@ -181,7 +193,8 @@ impl Schedule {
             .collect()
     }
 
-    /// What a process aims at: the results of its shard's cells, or the stage it was asked for in them.
+    /// What a process aims at: the results of its shard's cells, or the stage (or all stages of the group) it was asked for in
+    /// them.
     pub fn targets(&self, only: Option<&str>, shard: Shard) -> Result<BTreeSet<Key>, RunError> {
         let count = shard.count as usize;
         let mine = self
@@ -197,7 +210,10 @@ impl Schedule {
             .iter()
             .flat_map(|cell| cell.stages.iter().map(|(name, _)| name.as_str()))
             .collect();
-        if !names.contains(only) {
+        let group = format!("{only}.");
+        let of_group = |name: &str| name.starts_with(&group);
+        let whole = names.contains(only);
+        if !whole && !names.iter().any(|name| of_group(name)) {
             let names: Vec<String> = names.iter().map(|name| format!("`{name}`")).collect();
             return Err(RunError::Request {
                 message: format!("no stage `{only}` in `{}`", self.name),
@@ -206,7 +222,7 @@ impl Schedule {
         }
         let stages = mine.flat_map(|cell| &cell.stages);
         Ok(stages
-            .filter(|(name, _)| name == only)
+            .filter(|(name, _)| if whole { name == only } else { of_group(name) })
             .map(|(_, key)| *key)
             .collect())
     }

@@ -215,7 +215,7 @@ fn perform(
             checkpoints,
             seed: work.seed,
             data: around.data,
-            metrics: Some(Metrics::open(directory, hparams(&work.settings))?),
+            metrics: Some(Metrics::open(directory, hparams(work.settings.json()))?),
             log: directory.join("log.txt"),
             log_file: None,
             failed: None,
@@ -271,7 +271,7 @@ fn stage_path(directory: &Path, cache: &Cache) -> String {
 
 /// What decided the artifact, for its manifest. Paths stay out: where a file lies decides nothing.
 pub fn recipe(work: &Task) -> Recipe {
-    let mut settings = work.settings.clone();
+    let mut settings = work.settings.json().clone();
     for file in &work.files {
         let mut at = Some(&mut settings);
         for part in file.key.split('.') {

@@ -85,7 +85,7 @@ pub fn verify(
     interrupt: &Interrupt,
 ) -> Result<Vec<Check>, RunError> {
     let how = how.into();
-    let schedule: Schedule = files::read_json(&run.path().join("plan.json"))?;
+    let schedule = Schedule::read(run)?;
     let lock: LockFile = files::read_json(&run.path().join("lock.json"))?;
     let cache = Cache::of(run.runs());
     let mut checks = outside(&lock);

@@ -278,7 +278,7 @@ mod tests {
             kind: "clips".to_owned(),
             seed: 0,
             seeded: false,
-            settings: json!({}),
+            settings: json!({}).into(),
             inputs: vec![PortPlan {
                 port: "in".to_owned(),
                 from: inputs

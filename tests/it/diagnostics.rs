@@ -258,7 +258,7 @@ fn settings_of_another_entry_do_not_leak() {
     ]);
     let next = folder.sound("next.yaml", &[]);
     assert_eq!(
-        next.cells[0].graph.find("mget").unwrap().settings["masking"],
+        next.cells[0].graph.find("mget").unwrap().settings.json()["masking"],
         serde_json::json!({"use": "uniform", "policy": "uniform"})
     );
     folder.write(

@@ -14,14 +14,14 @@ fn an_experiment_becomes_a_graph_with_every_default_filled_in() {
     let names: Vec<&str> = graph.stages.iter().map(|s| s.name.as_str()).collect();
     assert_eq!(names, ["clips", "tok_body", "tok_camera", "mget", "scores"]);
     assert_eq!(
-        graph.find("clips").unwrap().settings,
+        *graph.find("clips").unwrap().settings.json(),
         json!({
             "source": {"use": "world_small", "rooms": 3, "data": null},
             "train": 20, "only": null, "keep_invalid": false,
         })
     );
     assert_eq!(
-        graph.find("mget").unwrap().settings["masking"],
+        graph.find("mget").unwrap().settings.json()["masking"],
         json!({"use": "dirichlet", "policy": "dirichlet", "alpha": 0.5})
     );
     assert_eq!(graph.find("mget").unwrap().edges[0].from, [1, 2]);
@@ -63,9 +63,9 @@ stages:
         ],
     );
     let mget = next.cells[0].graph.find("mget").unwrap();
-    assert_eq!(mget.settings["steps"], 60);
-    assert_eq!(mget.settings["rate"], 0.25);
-    assert_eq!(mget.settings["precision"], "single");
+    assert_eq!(mget.settings.json()["steps"], 60);
+    assert_eq!(mget.settings.json()["rate"], 0.25);
+    assert_eq!(mget.settings.json()["precision"], "single");
     assert_eq!(next.name, "next");
 }
 
@@ -86,10 +86,13 @@ fn parameters_and_the_environment_keep_their_types() {
     let experiment = experiment.unwrap_or_else(|| panic!("{}", report.render(false)));
     let graph = &experiment.cells[0].graph;
     let mget = graph.find("mget").unwrap();
-    assert_eq!(mget.settings["steps"], 9);
-    assert_eq!(mget.settings["masking"]["alpha"], 0.125);
+    assert_eq!(mget.settings.json()["steps"], 9);
+    assert_eq!(mget.settings.json()["masking"]["alpha"], 0.125);
     assert_eq!(mget.edges[0].from.len(), 1);
-    assert_eq!(graph.find("tok_body").unwrap().settings["modality"], "body");
+    assert_eq!(
+        graph.find("tok_body").unwrap().settings.json()["modality"],
+        "body"
+    );
 }
 
 const SWEEP: &str = "\
@@ -337,7 +340,7 @@ fn resolved_yaml_reads_back_as_the_same_experiment() {
         graph
             .stages
             .iter()
-            .map(|stage| stage.settings.clone())
+            .map(|stage| stage.settings.json().clone())
             .collect()
     };
     assert_eq!(stages(&first), stages(&again));

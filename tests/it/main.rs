@@ -13,6 +13,7 @@ mod egom2p_examples;
 mod evaluation;
 mod examples;
 mod full_disk;
+mod groups;
 mod metrics;
 mod modality_plugin;
 mod motion_metrics;

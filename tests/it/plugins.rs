@@ -95,7 +95,12 @@ fn a_linked_entry_is_an_entry_like_any_other() {
     let (experiment, report) = load(&catalog, &request);
     assert!(!report.failed(), "{}", report.render(false));
     let experiment = experiment.unwrap();
-    let settings = &experiment.cells[0].graph.find("mget").unwrap().settings;
+    let settings = &experiment.cells[0]
+        .graph
+        .find("mget")
+        .unwrap()
+        .settings
+        .json();
     assert_eq!(settings["masking"]["use"], "wrist_watch");
     assert_eq!(settings["masking"]["input_tokens"], 77);
     assert!(

@@ -185,8 +185,9 @@ fn stage(
 ) -> Stage {
     Stage {
         name: name.into(),
+        path: format!("stages.{name}"),
         op,
-        settings: op.normalize(settings).unwrap(),
+        settings: op.parse(settings).unwrap(),
         seed,
         edges,
         files: Vec::new(),
@@ -210,7 +211,7 @@ pub fn cell(arm: &str, seed: u64, numbers: Value, scale: f64) -> Cell {
         seed,
         graph: Graph {
             stages,
-            head: Vec::new(),
+            ..Graph::default()
         },
     }
 }

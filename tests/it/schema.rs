@@ -4,6 +4,7 @@ use reviv::evaluation::columns::Column;
 use reviv::evaluation::published::Published;
 use reviv::evaluation::suite::Suite;
 use reviv::experiment::catalog::Catalog;
+use reviv::experiment::load::entry;
 use reviv::experiment::schema;
 use std::path::Path;
 
@@ -91,13 +92,10 @@ fn every_metric_that_anything_shipped_names_is_a_column() {
     let catalog = Catalog::linked();
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
     let registry = reviv::experiment::registry::Registry::new(&catalog, None);
-    let entry = |kind: &str, name: &str| {
-        let value = reviv::experiment::load::entry(&catalog, &root.join("x.yaml"), kind, name);
-        value.unwrap_or_else(|| panic!("{kind} {name}"))
-    };
+    let place = root.join("x.yaml");
     let (mut suites, mut published) = (0, 0);
     for listed in registry.list(Some("suite")) {
-        let suite: Suite = serde_json::from_value(entry("suite", &listed.name)).unwrap();
+        let suite: Suite = entry(&catalog, &place, &listed.name).unwrap();
         let columns = suite
             .columns()
             .unwrap_or_else(|error| panic!("{}: {error}", listed.name));
@@ -109,7 +107,7 @@ fn every_metric_that_anything_shipped_names_is_a_column() {
         suites += 1;
     }
     for listed in registry.list(Some("published")) {
-        let rows: Published = serde_json::from_value(entry("published", &listed.name)).unwrap();
+        let rows: Published = entry(&catalog, &place, &listed.name).unwrap();
         assert!(!rows.rows.is_empty() && !rows.source.is_empty() && !rows.conditions.is_empty());
         for (row, name) in rows
             .rows
@@ -152,7 +150,7 @@ fn every_metric_that_anything_shipped_names_is_a_column() {
         let Some(name) = &compare.against else {
             continue;
         };
-        let rows: Published = serde_json::from_value(entry("published", name)).unwrap();
+        let rows: Published = entry(&catalog, &place, name).unwrap();
         let columns: Vec<Column> = rows
             .rows
             .iter()

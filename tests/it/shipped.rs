@@ -62,7 +62,7 @@ fn what_a_run_resolves_reads_back_as_the_same_stages() {
         let stages = &experiment.cells[0].graph.stages;
         stages
             .iter()
-            .map(|stage| (stage.name.clone(), stage.settings.clone(), stage.seed))
+            .map(|stage| (stage.name.clone(), stage.settings.json().clone(), stage.seed))
             .collect()
     };
     let folder = tempfile::tempdir().unwrap();

@@ -92,9 +92,7 @@ pub fn decoding(py: Python<'_>, name: Option<&str>) -> PyResult<DecodingSettings
         return Ok(DecodingSettings::default());
     };
     let catalog = Catalog::linked();
-    let entry = load::entry(&catalog, Path::new("./x"), "decoding", name);
-    let settings = entry.and_then(|entry| serde_json::from_value(entry).ok());
-    settings.ok_or_else(|| {
+    load::entry(&catalog, Path::new("./x"), name).ok_or_else(|| {
         let message = format!("no decoding `{name}`");
         refused(py, message, "`reviv list decoding` shows all")
     })

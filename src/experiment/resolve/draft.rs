@@ -3,6 +3,7 @@
 use super::{Draft, Resolver};
 use crate::experiment::diagnostic::{Diagnostic, Span};
 use crate::experiment::graph::Graph;
+use crate::experiment::group::Written;
 use crate::experiment::names;
 use crate::experiment::problem::Code;
 use crate::experiment::stage::AnyOp;
@@ -17,12 +18,13 @@ impl Resolver<'_> {
     /// Op, settings and the names of the inputs of a stage.
     pub(super) fn draft(
         &mut self,
-        item: &Item,
-        all: &[Item],
+        written: &Written,
+        all: &[Written],
         seed: u64,
         graph: &mut Graph,
         places: &mut BTreeMap<(PathBuf, String), usize>,
     ) -> Option<Draft> {
+        let item = &written.item;
         let node = &item.value;
         if !sweep::is_name(&item.key) {
             self.diagnostics.push(
@@ -77,11 +79,11 @@ impl Resolver<'_> {
             diagnostics: self.diagnostics,
             traces,
             beside,
-            prefix: format!("stages.{}.", item.key),
+            prefix: format!("{}.", written.path),
         };
         let value = typer.value(schema, &own, "");
         let traces = typer.traces;
-        let settings = value.and_then(|value| match op.normalize(value.clone()) {
+        let settings = value.and_then(|value| match op.parse(value.clone()) {
             Ok(settings) => Some(settings),
             Err(error) => {
                 let (key, span) = culprit(op, &value, &traces).unwrap_or((None, node.span));
@@ -98,6 +100,7 @@ impl Resolver<'_> {
         sound &= settings.is_some();
         Some(Draft {
             name: item.key.clone(),
+            path: written.path.clone(),
             key_span: item.key_span,
             span: node.span,
             op,
@@ -110,9 +113,10 @@ impl Resolver<'_> {
         })
     }
 
-    pub(super) fn op(&mut self, item: &Item, all: &[Item]) -> Option<&'static dyn AnyOp> {
+    pub(super) fn op(&mut self, item: &Item, all: &[Written]) -> Option<&'static dyn AnyOp> {
         let node = &item.value;
-        let ops: Vec<&str> = self.catalog.ops().iter().map(|op| op.name()).collect();
+        let mut ops: Vec<&str> = self.catalog.ops().iter().map(|op| op.name()).collect();
+        ops.extend(self.catalog.groups().iter().map(|group| group.name));
         if !matches!(node.data, Data::Map(_)) {
             self.diagnostics.push(
                 Diagnostic::new(
@@ -129,7 +133,7 @@ impl Resolver<'_> {
             // A patch of a stage that does not exist looks like this.
             let others: Vec<&str> = all
                 .iter()
-                .map(|other| other.key.as_str())
+                .map(|other| other.item.key.as_str())
                 .filter(|name| *name != item.key)
                 .collect();
             let near = names::nearest(&item.key, others.iter().copied());
@@ -177,7 +181,7 @@ fn culprit(
     for key in whole.keys() {
         let mut without = whole.clone();
         without.remove(key);
-        if op.normalize(Value::Object(without)).is_ok() {
+        if op.parse(Value::Object(without)).is_ok() {
             return traces.get(key).map(|trace| (Some(key.clone()), trace.span));
         }
     }

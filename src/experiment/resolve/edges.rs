@@ -88,7 +88,9 @@ impl Resolver<'_> {
             return None;
         }
         let mut targets = Vec::new();
-        for (index, node) in nodes.into_iter().enumerate() {
+        let single = matches!(port.arity, Arity::One | Arity::Optional);
+        let mut sound = true;
+        for node in nodes {
             let Some(name) = node.text() else {
                 self.diagnostics.push(Diagnostic::new(
                     Code::E0301,
@@ -108,19 +110,39 @@ impl Resolver<'_> {
                 );
                 continue;
             }
-            traces.insert(format!("{}.{index}", port.name), Trace::of(node));
-            let to = if name.contains('/') {
+            let ends = if name.contains('/') {
                 self.import(name, node.span, graph, places)
+            } else if let Some(group) = graph.groups.iter().find(|group| group.name == name) {
+                let members = group.members.iter();
+                members.map(|own| (own.clone(), To::Unknown)).collect()
             } else {
-                To::Unknown
+                vec![(name.to_owned(), To::Unknown)]
             };
-            targets.push(Target {
-                name: name.to_owned(),
-                span: node.span,
-                to,
-            });
+            // A group with mistakes stands for nothing: that has been said.
+            sound &= !ends.is_empty();
+            if single && ends.len() > 1 {
+                let names: Vec<String> = ends.iter().map(|(name, _)| format!("`{name}`")).collect();
+                let message = format!(
+                    "`{}` takes one stage, and `{name}` stands for {}",
+                    port.name,
+                    names.len()
+                );
+                self.diagnostics.push(
+                    Diagnostic::new(Code::E0301, node.span, message)
+                        .help(format!("name one of {}", names.join(", "))),
+                );
+                return None;
+            }
+            for (name, to) in ends {
+                traces.insert(format!("{}.{}", port.name, targets.len()), Trace::of(node));
+                targets.push(Target {
+                    name,
+                    span: node.span,
+                    to,
+                });
+            }
         }
-        Some(targets)
+        sound.then_some(targets)
     }
 
     /// Every edge must end at a stage that makes what the port reads.
@@ -138,12 +160,18 @@ impl Resolver<'_> {
                 for target in targets {
                     let kinds: Vec<&str> = port.kinds.iter().map(|kind| kind.name()).collect();
                     let kinds = kinds.join(" or ");
-                    let fitting: Vec<&str> = facts
+                    let mut fitting: Vec<&str> = facts
                         .iter()
                         .flatten()
                         .filter(|(name, kind, _)| port.kinds.contains(kind) && *name != draft.name)
                         .map(|(name, ..)| name.as_str())
                         .collect();
+                    for group in &graph.groups {
+                        let mut members = group.members.iter();
+                        if members.any(|own| fitting.contains(&own.as_str())) {
+                            fitting.push(&group.name);
+                        }
+                    }
                     let (kind, made) = match target.to {
                         To::Local(index) => {
                             let Some((_, kind, span)) = &facts[index] else {

@@ -13,14 +13,15 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 impl Resolver<'_> {
-    /// A stage of another experiment, with everything it needs, put into the graph.
+    /// A stage of another experiment, or all stages of a group, with everything they need, put into the graph; with their names.
     pub(super) fn import(
         &mut self,
         name: &str,
         asked: Span,
         graph: &mut Graph,
         places: &mut BTreeMap<(PathBuf, String), usize>,
-    ) -> To {
+    ) -> Vec<(String, To)> {
+        let unknown = vec![(name.to_owned(), To::Unknown)];
         let (file, stage) = name.rsplit_once('/').unwrap_or(("", name));
         let file = if Path::new(file).extension().is_some() {
             file.to_owned()
@@ -39,7 +40,7 @@ impl Resolver<'_> {
                 )
                 .label("this closes it"),
             );
-            return To::Unknown;
+            return unknown;
         }
         if !self.imports.contains_key(&identity) {
             let root = composer.named(&file, asked, Origin::Imported);
@@ -64,10 +65,19 @@ impl Resolver<'_> {
             self.imports.insert(identity.clone(), imported);
         }
         let Some(Some(imported)) = self.imports.get(&identity) else {
-            return To::Unknown;
+            return unknown;
         };
-        let Some(wanted) = imported.stages.iter().position(|s| s.name == stage) else {
-            let known: Vec<&str> = imported.stages.iter().map(|s| s.name.as_str()).collect();
+        let group = imported.groups.iter().find(|group| group.name == stage);
+        let members: Vec<&str> = group.map_or_else(
+            || vec![stage],
+            |group| group.members.iter().map(String::as_str).collect(),
+        );
+        let stages = members
+            .iter()
+            .map(|name| imported.stages.iter().position(|s| s.name == *name));
+        let Some(stages) = stages.collect::<Option<Vec<usize>>>() else {
+            let mut known: Vec<&str> = imported.stages.iter().map(|s| s.name.as_str()).collect();
+            known.extend(imported.groups.iter().map(|group| group.name.as_str()));
             self.diagnostics.push(
                 Diagnostic::new(
                     Code::E0301,
@@ -76,14 +86,20 @@ impl Resolver<'_> {
                 )
                 .help(names::suggest(stage, &known).unwrap_or_default()),
             );
-            return To::Unknown;
+            return unknown;
         };
         let prefix = Path::new(&file)
             .file_stem()
             .unwrap_or_default()
             .to_string_lossy()
             .into_owned();
-        To::Imported(copy(imported, wanted, &identity, &prefix, graph, places))
+        let mut ends = Vec::new();
+        for index in stages {
+            let at = copy(imported, index, &identity, &prefix, graph, places);
+            let own = group.map_or(name, |_| graph.stages[at].name.as_str());
+            ends.push((own.to_owned(), To::Imported(at)));
+        }
+        ends
     }
 }
 
@@ -110,6 +126,8 @@ fn copy(
     // A stage that the other experiment reads from a third keeps that name.
     if !copied.name.contains('/') {
         copied.name = format!("{prefix}/{}", stage.name);
+        let path = stage.path.trim_start_matches("stages.");
+        copied.path = format!("stages.{prefix}/{path}");
     }
     into.stages.push(copied);
     places.insert(key, into.stages.len() - 1);
