@@ -51,7 +51,8 @@ fn shrink_stage(stage: &mut Map<String, Value>) {
                 json!({"validation": 0.3, "test": 0.0, "official": false, "validation_recordings": none, "test_recordings": none}),
             );
         }
-        "train_tokenizer" => {
+        // A group names one tokenizer for all of its modalities.
+        "train_tokenizer" | "train_tokenizers" => {
             let video = stage["tokenizer"]
                 .as_str()
                 .is_some_and(|name| name.starts_with("cosmos"));

@@ -62,7 +62,13 @@ fn what_a_run_resolves_reads_back_as_the_same_stages() {
         let stages = &experiment.cells[0].graph.stages;
         stages
             .iter()
-            .map(|stage| (stage.name.clone(), stage.settings.json().clone(), stage.seed))
+            .map(|stage| {
+                (
+                    stage.name.clone(),
+                    stage.settings.json().clone(),
+                    stage.seed,
+                )
+            })
             .collect()
     };
     let folder = tempfile::tempdir().unwrap();
@@ -191,4 +197,12 @@ fn the_papers_tokenizers_have_the_papers_parameters() {
     assert_eq!(sweep["cells"].as_array().unwrap().len(), 6);
     // Clips once, a tokenizer per arm.
     assert_eq!(sweep["stages"].as_array().unwrap().len(), 1 + 6);
+}
+
+#[test]
+fn the_first_experiment_fits_on_one_screen() {
+    let text = std::fs::read_to_string(root().join("experiments/quickstart.yaml")).unwrap();
+    let longest = text.lines().map(|line| line.chars().count()).max();
+    assert!(text.lines().count() <= 55, "{} lines", text.lines().count());
+    assert!(longest <= Some(130), "{longest:?}");
 }
