@@ -419,6 +419,7 @@ fn training(mut file: Vectors, report: &mut Report) -> Outcome {
         weight_decay: number(&settings["weight_decay"])?,
         clip_norm: Some(number(&settings["clip"])?),
         shard: false,
+        muon: false,
     };
     model.start_training();
     let mut optimizer = AdamW::new(settings, &model);

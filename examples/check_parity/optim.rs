@@ -62,6 +62,7 @@ fn adamw(mut file: Vectors, report: &mut Report) -> Outcome {
             weight_decay: number(&settings["weight_decay"])?,
             clip_norm: Some(number(&settings["clip"])?),
             shard: false,
+            muon: false,
         },
         &model,
     );

@@ -7,6 +7,7 @@ use super::terminal::{Failure, Terminal};
 use crate::engine::DeviceChoice;
 use crate::experiment::catalog::Catalog;
 use crate::experiment::load::Request;
+use crate::model::shipped;
 use crate::ops::ReconstructSettings;
 use crate::reconstruction::dataset::write_nerfstudio;
 use crate::reconstruction::folder::{FOLDER, MANIFEST, Manifest, PAGE};
@@ -43,7 +44,8 @@ pub struct Reconstruct {
     /// The folder to make [default: the video's name with `_reconstruction`]
     #[arg(short, long, value_name = "DIR")]
     output: Option<PathBuf>,
-    /// A run that trained a model, or a model folder [default: the model of the latest finished run]
+    /// A run that trained a model, or a model folder [default: the model of the latest finished run, or
+    /// else the one that comes with the program]
     #[arg(long, value_name = "MODEL")]
     model: Option<PathBuf>,
     /// How tokens are generated: `fast`, `paper`, `release`, or your own entry
@@ -339,10 +341,11 @@ fn linked(file: &Path, _runs: &Path) -> Result<PathBuf, Failure> {
     Ok(file.to_owned())
 }
 
-/// The folder of a model: `given` is one, or a run that trained one; without it, the latest run that did.
+/// The folder of a model: `given` is one, or a run that trained one; without it, the latest run that did, or else the model that
+/// comes with the program.
 ///
 /// # Errors
-/// When there is none.
+/// When `given` is none, or the folder of runs cannot be read or written.
 pub fn find_model(runs: &Path, given: Option<&Path>) -> Result<PathBuf, RunError> {
     if let Some(given) = given {
         if given.join("run.json").is_file() || !given.exists() {
@@ -361,11 +364,12 @@ pub fn find_model(runs: &Path, given: Option<&Path>) -> Result<PathBuf, RunError
     finished.sort_by(|a, b| b.0.cmp(&a.0));
     let models = finished.iter();
     let mut models = models.filter_map(|(_, run)| artifact_of(run, MODEL));
-    models.next().ok_or_else(|| RunError::Request {
-        message: format!("no model at hand: no run in `{}` trained one", runs.display()),
-        help: "`reviv run experiments/quickstart.yaml` trains a small one in minutes; `reviv import` reads released \
-               weights; `--model` takes either"
-            .into(),
+    if let Some(found) = models.next() {
+        return Ok(found);
+    }
+    shipped::unpack(&runs.join("models")).map_err(|error| RunError::Request {
+        message: error.to_string(),
+        help: "the model that comes with the program is written there once; `--runs` names another folder".into(),
     })
 }
 

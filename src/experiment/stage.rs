@@ -329,9 +329,13 @@ impl<O: Op> AnyOp for O {
     fn explain_panic(&self, text: &str) -> Option<StageError> {
         Op::explain_panic(self, text)
     }
-    fn run(&self, settings: &Value, context: &mut dyn StageContext) -> Result<Value, StageError> {
-        let settings = typed::<O>(settings).map_err(StageError::other)?;
-        Op::run(self, &settings, context)
+    fn run(
+        &self,
+        settings: &Settings,
+        context: &mut dyn StageContext,
+    ) -> Result<Value, StageError> {
+        let made = settings.with(|own: &O::Settings| Op::run(self, own, context));
+        made.map_err(StageError::other)?
     }
 }
 

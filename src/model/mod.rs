@@ -10,6 +10,7 @@ mod evaluate;
 mod manifest;
 mod mean;
 mod pathway;
+pub mod shipped;
 mod tokenizers;
 
 pub use error::ModelError;

@@ -93,7 +93,7 @@ mod tests {
                 x.clone().matmul(x.transpose())
             };
             let side = rows.min(columns);
-            let gram: Vec<f32> = gram.into_data().to_vec().unwrap();
+            let gram = crate::engine::parameters::to_host(gram);
             // The sum of squared singular values, and that of their fourth powers.
             let trace: f32 = (0..side).map(|i| gram[i * side + i]).sum();
             let fourth: f32 = gram.iter().map(|v| v * v).sum();

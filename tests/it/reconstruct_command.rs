@@ -325,16 +325,23 @@ fn a_model_that_is_none_or_not_whole_is_refused() {
     place.refuses("walk", "no model folder");
     std::fs::remove_dir_all(place.path("model")).unwrap();
     place.refuses("walk", "no run `model`");
-    let none = Command::new(env!("CARGO_BIN_EXE_reviv"))
+}
+
+#[test]
+fn without_a_model_and_a_run_the_one_that_comes_with_the_program_is_used_and_says_what_it_is() {
+    let place = Place::new();
+    pictures(&place.path("walk"), 20, [48, 40], false);
+    let said = Command::new(env!("CARGO_BIN_EXE_reviv"))
         .current_dir(place.root.path())
         .args(["reconstruct", "walk", "-o", "out"])
         .assert()
-        .code(1);
-    let said = String::from_utf8_lossy(&none.get_output().stderr).into_owned();
-    assert!(
-        said.contains("reviv run experiments/quickstart.yaml"),
-        "{said}"
-    );
+        .success();
+    let said = String::from_utf8_lossy(&said.get_output().stderr).into_owned();
+    assert!(said.contains("models/world-"), "{said}");
+    assert!(said.contains("synthetic"), "{said}");
+    for name in ["camera.npz", "body.npz", "hands.npz", "gaze.npz", "depth.npz"] {
+        assert!(place.path("out").join(name).is_file(), "{name} is missing");
+    }
 }
 
 #[test]
