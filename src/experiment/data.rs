@@ -5,6 +5,7 @@ use super::files::{beside, read_bytes};
 use super::problem::Code;
 use super::source::{Origin, Source, Sources};
 use super::yaml;
+use crate::formats::place;
 use figment::value::{Dict, Map, Value};
 use figment::{Figment, Metadata, Profile, Provider};
 use std::collections::BTreeMap;
@@ -13,7 +14,7 @@ use std::path::{Path, PathBuf};
 /// The folder of a data set.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct DataRoot {
-    /// The folder; a relative path in `data.yaml` is taken from that file's own folder.
+    /// The folder, or the `s3://` address of converted clips; a relative path in `data.yaml` is taken from that file's own folder.
     pub path: PathBuf,
     /// Who says so: `data.yaml` or `REVIV_DATA_ADT`.
     pub set_by: String,
@@ -138,7 +139,12 @@ fn file(
     for item in node.items() {
         match item.value.text() {
             Some(path) => {
-                roots.insert(item.key.clone(), folder.join(path).display().to_string());
+                let at = if place::is_remote(Path::new(path)) {
+                    path.to_owned()
+                } else {
+                    folder.join(path).display().to_string()
+                };
+                roots.insert(item.key.clone(), at);
             }
             None => diagnostics.push(Diagnostic::new(
                 Code::E0202,

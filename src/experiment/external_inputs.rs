@@ -4,6 +4,7 @@ use super::data::DataRoot;
 use super::diagnostic::{Diagnostic, Span};
 use super::problem::Code;
 use super::stage::{DataInput, FileInput};
+use crate::formats::place;
 use std::collections::BTreeMap;
 
 /// The data sets of a stage with the folders they lie in; none where nothing says so, or where no folder is. Optional ones that are
@@ -14,7 +15,9 @@ pub fn data(
     roots: &BTreeMap<String, DataRoot>,
 ) -> Vec<DataInput> {
     let found = |(name, key): (String, String)| {
-        let root = roots.get(&name).filter(|root| root.path.is_dir());
+        let root = roots
+            .get(&name)
+            .filter(|root| place::may_be_folder(&root.path));
         DataInput {
             path: root.map(|root| root.path.clone()),
             name,
@@ -56,6 +59,15 @@ pub fn missing_data(
         Code::E0601
     };
     let diagnostic = match root {
+        Some(root) if place::is_remote(&root.path) => Diagnostic::new(
+            code,
+            span,
+            format!(
+                "data set `{name}`: `{}` is read by builds with the feature `s3`, and this is none",
+                root.path.display()
+            ),
+        )
+        .help("`cargo build --release --features s3`, or copy it to a disk"),
         Some(root) => Diagnostic::new(
             code,
             span,

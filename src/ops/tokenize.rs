@@ -18,6 +18,7 @@ use crate::experiment::{
 };
 use crate::flow::Flow;
 use crate::formats::ReadError;
+use crate::formats::place;
 use crate::masking::PIXELS;
 use crate::modality::ClipFormat;
 use crate::tokenizer;
@@ -364,6 +365,10 @@ fn take_made(
         message: format!("{}: {message}", root.display()),
         help: help.to_owned(),
     };
+    if place::is_remote(root) {
+        let message = "tokens are taken from a disk, and this is an address of an object store";
+        return Err(refused(message.to_owned(), "copy them to a disk"));
+    }
     let found = TokenHeader::read(root).map_err(|error| {
         let help = "`reviv data tokenize` makes such a folder";
         refused(error.to_string(), help)

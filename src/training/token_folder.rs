@@ -21,9 +21,8 @@ use crate::datasets::shards::{Content, Marker};
 use crate::flow::Flow;
 use crate::formats::ReadError;
 use crate::formats::npz::Npz;
+use crate::formats::place;
 use crate::formats::read_error::Position;
-use crate::formats::text::read_json;
-use crate::formats::write_atomically;
 use crate::masking::PIXELS;
 use crate::modality::{ClipFormat, Modality};
 use crate::model::{ModelManifest, TOKENIZERS};
@@ -178,7 +177,7 @@ impl TokenHeader {
     /// When it is not there or not of this form.
     pub fn read(root: &Path) -> Result<Self, ReadError> {
         let path = root.join(FILE);
-        let header: Self = read_json(&path)?;
+        let header: Self = place::read_json(&path)?;
         if header.clips_per_shard == 0 {
             let reason = "`clips_per_shard` is 0".to_owned();
             return Err(ReadError::malformed(&path, Position::File, reason));
@@ -222,7 +221,8 @@ impl TokenHeader {
     /// # Errors
     /// When the folder holds something else, or the disk refuses.
     pub fn begin(&self, root: &Path) -> Result<(), ReadError> {
-        if root.join(FILE).is_file() {
+        let fail = |cause| ReadError::io(root, cause);
+        if place::is_file(&root.join(FILE)).map_err(fail)? {
             let there = Self::read(root)?;
             if there == *self {
                 return Ok(());
@@ -232,17 +232,17 @@ impl TokenHeader {
             let reason = format!("holds other tokens ({difference}); name another folder");
             return Err(ReadError::unsupported(root, reason));
         }
-        let empty = std::fs::read_dir(root).map_or(true, |mut inside| inside.next().is_none());
+        let empty = place::is_empty(root).map_err(fail)?;
         // Another process with a share of the same work may have begun in between.
-        if !empty && root.join(FILE).is_file() {
+        if !empty && place::is_file(&root.join(FILE)).map_err(fail)? {
             return self.begin(root);
         }
         if !empty {
             let reason = "is not empty and holds no tokens; name another folder";
             return Err(ReadError::unsupported(root, reason));
         }
-        std::fs::create_dir_all(root).map_err(|cause| ReadError::io(root, cause))?;
-        write_json(&root.join(FILE), self)
+        place::make_folder(root).map_err(fail)?;
+        place::write_json(&root.join(FILE), self)
     }
 
     /// In which way it speaks of other tokens than `other`, if it does; how many clips a shard has does not matter.
@@ -316,9 +316,17 @@ fn digest(tokenizer: &dyn Tokenizer) -> Result<String, TrainingError> {
 /// Writes the tokenizers beside the tokens, each there whole or not at all.
 fn keep(modalities: &[ModalityTokens], root: &Path) -> Result<(), TrainingError> {
     let folder = root.join(TOKENIZERS);
-    std::fs::create_dir_all(&folder).map_err(|cause| ReadError::io(&folder, cause))?;
+    let fail = |cause| ReadError::io(&folder, cause);
+    place::make_folder(&folder).map_err(fail)?;
     for tokens in modalities {
         let place = folder.join(tokens.modality.name());
+        if place::is_remote(root) {
+            // Objects have no rename: equal tokenizers have equal bytes, and whoever comes second writes the same.
+            let draft = tempfile::tempdir().map_err(fail)?;
+            tokens.tokenizer.write(draft.path())?;
+            place::store(draft.path(), &place).map_err(fail)?;
+            continue;
+        }
         if place.is_dir() {
             continue;
         }
@@ -334,12 +342,6 @@ fn keep(modalities: &[ModalityTokens], root: &Path) -> Result<(), TrainingError>
     Ok(())
 }
 
-fn write_json(path: &Path, value: &impl Serialize) -> Result<(), ReadError> {
-    let text =
-        serde_json::to_vec_pretty(value).map_err(|error| ReadError::Settings(error.to_string()))?;
-    Ok(write_atomically(path, &text)?)
-}
-
 /// Where it is written what a finished shard holds.
 fn marker(root: &Path, split: &str, number: u32) -> PathBuf {
     root.join(FINISHED)
@@ -347,7 +349,7 @@ fn marker(root: &Path, split: &str, number: u32) -> PathBuf {
 }
 
 fn finished(root: &Path, split: &str, number: u32) -> Option<Marker> {
-    let bytes = std::fs::read(marker(root, split, number)).ok()?;
+    let bytes = place::read(&marker(root, split, number)).ok()?;
     serde_json::from_slice(&bytes).ok()
 }
 
@@ -400,7 +402,7 @@ impl Tokenization<'_> {
         self.header.begin(root)?;
         keep(self.modalities, root)?;
         let markers = root.join(FINISHED);
-        std::fs::create_dir_all(&markers).map_err(|cause| ReadError::io(&markers, cause))?;
+        place::make_folder(&markers).map_err(|cause| ReadError::io(&markers, cause))?;
         let own = |(index, shard)| self.share.has(index).then_some(shard);
         let shards: Vec<_> = self.header.shards().enumerate().filter_map(own).collect();
         let total = shards.iter().map(|(_, _, range)| range.len()).sum();
@@ -451,15 +453,16 @@ impl Tokenization<'_> {
         let names = self.header.tokens.keys().map(String::as_str);
         for name in names.chain(self.header.pixels.then_some(PIXELS)) {
             let file = format!("{split}/{name}/shard-{number:06}.tar");
-            if root.join(&file).is_file() {
-                files.insert(file.clone(), Content::of(&root.join(&file))?);
+            let path = root.join(&file);
+            if place::is_file(&path).map_err(|cause| ReadError::io(&path, cause))? {
+                files.insert(file.clone(), Content::of(&path)?);
             }
         }
         let tally = Tally {
             clips: count,
             ..Tally::default()
         };
-        write_json(&marker(root, split, number), &Marker { tally, files })?;
+        place::write_json(&marker(root, split, number), &Marker { tally, files })?;
         Ok(true)
     }
 }

@@ -13,7 +13,7 @@ pub(super) struct Convert {
     /// A recording, a video, or a folder of them
     #[arg(value_name = "PATH")]
     path: PathBuf,
-    /// The folder of the shards
+    /// The folder of the shards, or `s3://bucket/prefix` (builds with the feature `s3`)
     #[arg(short, long, value_name = "DIR")]
     output: PathBuf,
     #[command(flatten)]

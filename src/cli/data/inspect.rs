@@ -5,6 +5,7 @@ use super::super::terminal::{Failure, Terminal};
 use super::{Cut, failure, remarks, source_entry};
 use crate::datasets::ClipSource;
 use crate::datasets::survey::{Survey, survey};
+use crate::formats::place;
 use crate::formats::png;
 use crate::formats::text::of_path;
 use crate::modality::inventory::Row;
@@ -88,7 +89,7 @@ impl Inspect {
     }
 
     fn source(&self, terminal: &Terminal) -> Result<Arc<dyn ClipSource>, Failure> {
-        if self.path.exists() {
+        if self.path.exists() || place::is_remote(&self.path) {
             let mut settings = self.cut.settings();
             let source = self.cut.open(&self.path, &settings)?;
             if !source.is_empty() || settings.pad_short {

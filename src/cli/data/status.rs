@@ -12,6 +12,7 @@ use crate::experiment::data::{DataRoot, roots};
 use crate::experiment::files;
 use crate::experiment::registry::Registry;
 use crate::experiment::source::Sources;
+use crate::formats::place;
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -164,7 +165,7 @@ fn look(name: String, plan: &Plan, roots: &BTreeMap<String, DataRoot>) -> Row {
     let Some(root) = root else {
         return row;
     };
-    if !root.path.exists() {
+    if !root.path.exists() && !place::is_remote(&root.path) {
         row.state = "not found";
         row.reason = Some("the folder does not exist".to_owned());
         return row;

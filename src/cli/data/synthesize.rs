@@ -16,7 +16,7 @@ pub(super) struct Synthesize {
     /// How many clips
     #[arg(short = 'n', long, value_name = "N")]
     clips: u64,
-    /// The folder of the shards
+    /// The folder of the shards, or `s3://bucket/prefix` (builds with the feature `s3`)
     #[arg(short, long, value_name = "DIR")]
     output: PathBuf,
     /// Another seed is another world

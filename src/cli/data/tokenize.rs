@@ -4,11 +4,12 @@ use super::super::run::{interruptible, progress};
 use super::super::terminal::{Failure, Terminal};
 use super::failure;
 use crate::clip::store::ClipSet;
-use crate::datasets::ClipSource;
 use crate::datasets::convert::Share;
 use crate::datasets::shards::ShardClips;
+use crate::datasets::{ClipSource, ReadError};
 use crate::engine::Compute;
 use crate::flow::Flow;
+use crate::formats::place;
 use crate::formats::text::of_path;
 use crate::modality;
 use crate::tokenizer;
@@ -20,10 +21,10 @@ use std::path::{Path, PathBuf};
 /// Turn converted clips into shards of tokens, as the op `tokenize` does; continue where it was interrupted
 #[derive(Debug, clap::Args)]
 pub(super) struct Tokenize {
-    /// Clips: an artifact of the op `clips`, or a folder that `reviv data convert` made
+    /// Clips: an artifact of the op `clips`, or what `reviv data convert` made, in a folder or at an `s3://` address
     #[arg(value_name = "CLIPS")]
     clips: PathBuf,
-    /// The folder of the tokens
+    /// The folder of the tokens, or `s3://bucket/prefix` (builds with the feature `s3`)
     #[arg(short, long, value_name = "DIR")]
     output: PathBuf,
     /// The folders of tokenizers, one per modality: artifacts of `train_tokenizer`, or imported ones
@@ -146,7 +147,8 @@ impl Tokenize {
         let mut sets = BTreeMap::new();
         for split in ["train", "validation", "test"] {
             let folder = self.clips.join(split);
-            if folder.is_dir() {
+            let there = place::is_folder(&folder);
+            if there.map_err(|cause| failure(ReadError::io(&folder, cause)))? {
                 sets.insert(split.to_owned(), open(&folder)?);
             }
         }

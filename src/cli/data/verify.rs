@@ -2,15 +2,17 @@
 
 use super::super::terminal::{Failure, Terminal};
 use super::failure;
+use crate::datasets::ReadError;
 use crate::datasets::shards;
 use crate::datasets::verify::verify;
+use crate::formats::place;
 use crate::training::token_folder;
 use std::path::PathBuf;
 
 /// Check a folder of converted clips or of tokens: every shard there, every file as it was written, every clip counted
 #[derive(Debug, clap::Args)]
 pub(super) struct Verify {
-    /// A folder that `reviv data convert`, `synthesize` or `tokenize` made
+    /// A folder that `reviv data convert`, `synthesize` or `tokenize` made, or its `s3://` address
     #[arg(value_name = "DIR")]
     folder: PathBuf,
     /// Write the result as JSON to stdout
@@ -20,10 +22,13 @@ pub(super) struct Verify {
 
 impl Verify {
     pub(super) fn run(self, terminal: &Terminal) -> Result<(), Failure> {
-        let holds = |file: &str| self.folder.join(file).is_file();
-        let found = if holds(token_folder::FILE) {
+        let holds = |file: &str| {
+            let path = self.folder.join(file);
+            place::is_file(&path).map_err(|cause| failure(ReadError::io(&path, cause)))
+        };
+        let found = if holds(token_folder::FILE)? {
             token_folder::verify(&self.folder)
-        } else if holds(shards::FILE) {
+        } else if holds(shards::FILE)? {
             verify(&self.folder)
         } else {
             let folder = self.folder.display();

@@ -5,10 +5,26 @@ use crate::datasets::convert::Tally;
 use crate::datasets::shards::{Content, tars};
 use crate::datasets::verify::Verified;
 use crate::formats::ReadError;
+use crate::formats::place;
 use crate::model::{ModelManifest, TOKENIZERS};
 use rayon::prelude::*;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
+
+/// The digests of the tokenizers, which are fetched from an object store.
+fn digests(root: &Path) -> Result<BTreeMap<String, String>, String> {
+    if !place::is_remote(root) {
+        return ModelManifest::digests(root).map_err(|error| error.to_string());
+    }
+    let fetch = || -> std::io::Result<tempfile::TempDir> {
+        let folder = tempfile::tempdir()?;
+        let to = folder.path().join(TOKENIZERS);
+        place::fetch(&root.join(TOKENIZERS), &to)?;
+        Ok(folder)
+    };
+    let fetched = fetch().map_err(|cause| ReadError::io(root, cause).to_string())?;
+    ModelManifest::digests(fetched.path()).map_err(|error| error.to_string())
+}
 
 /// Compares a folder of tokens with what was written down when its shards were made.
 ///
@@ -65,7 +81,7 @@ pub fn verify(root: &Path) -> Result<Verified, ReadError> {
             }
         }
     }
-    match ModelManifest::digests(root) {
+    match digests(root) {
         Ok(digests) => {
             for (name, kind) in &header.tokens {
                 if digests.get(name) != Some(&kind.tokenizer) {
@@ -75,7 +91,7 @@ pub fn verify(root: &Path) -> Result<Verified, ReadError> {
                 }
             }
         }
-        Err(error) => found.problems.push(error.to_string()),
+        Err(error) => found.problems.push(error),
     }
     Ok(found)
 }

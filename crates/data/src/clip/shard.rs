@@ -9,8 +9,8 @@
 //! one at a time when asked for, in any order, so memory does not grow with the data. Tars are untrusted: a size is compared
 //! with the file before anything is allocated.
 
-use crate::formats::FormatError;
 use crate::formats::tar::{self, Member};
+use crate::formats::{FormatError, place};
 use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::BufWriter;
@@ -75,7 +75,17 @@ fn io(path: &Path) -> impl FnOnce(std::io::Error) -> ShardError + '_ {
 pub struct ShardWriter {
     root: PathBuf,
     number: u32,
-    open: BTreeMap<String, (PathBuf, ::tar::Builder<BufWriter<File>>)>,
+    open: BTreeMap<String, Open>,
+    /// Where tars grow that are sent away when they are complete.
+    drafts: Option<tempfile::TempDir>,
+}
+
+/// A tar that grows.
+struct Open {
+    path: PathBuf,
+    /// Where it lies until it is complete.
+    temporary: PathBuf,
+    builder: ::tar::Builder<BufWriter<File>>,
 }
 
 impl ShardWriter {
@@ -85,7 +95,35 @@ impl ShardWriter {
             root: root.to_owned(),
             number,
             open: BTreeMap::new(),
+            drafts: None,
         }
+    }
+
+    /// Begins the tar in `folder`.
+    fn begin(&mut self, folder: &str) -> Result<Open, ShardError> {
+        let place = self.root.join(folder);
+        place::make_folder(&place).map_err(io(&place))?;
+        let path = place.join(format!("shard-{:06}.tar", self.number));
+        let temporary = if place::is_remote(&path) {
+            if self.drafts.is_none() {
+                let made = tempfile::tempdir().map_err(io(&std::env::temp_dir()))?;
+                self.drafts = Some(made);
+            }
+            let drafts = self
+                .drafts
+                .as_ref()
+                .map_or(Path::new("."), tempfile::TempDir::path);
+            drafts.join(format!("{:06}.tar", self.open.len()))
+        } else {
+            path.with_extension("tar.part")
+        };
+        let file = File::create(&temporary).map_err(io(&temporary))?;
+        let builder = ::tar::Builder::new(BufWriter::with_capacity(1 << 18, file));
+        Ok(Open {
+            path,
+            temporary,
+            builder,
+        })
     }
 
     /// Adds a member to the tar in `folder` (`camera/world`, `camera/world/token`).
@@ -103,15 +141,10 @@ impl ShardWriter {
             });
         }
         if !self.open.contains_key(folder) {
-            let place = self.root.join(folder);
-            std::fs::create_dir_all(&place).map_err(io(&place))?;
-            let path = place.join(format!("shard-{:06}.tar", self.number));
-            let temporary = path.with_extension("tar.part");
-            let file = File::create(&temporary).map_err(io(&temporary))?;
-            let builder = ::tar::Builder::new(BufWriter::with_capacity(1 << 18, file));
-            self.open.insert(folder.to_owned(), (path, builder));
+            let open = self.begin(folder)?;
+            self.open.insert(folder.to_owned(), open);
         }
-        let (path, builder) = self
+        let Open { path, builder, .. } = self
             .open
             .get_mut(folder)
             .expect("the folder's tar was opened above");
@@ -130,14 +163,18 @@ impl ShardWriter {
     /// # Errors
     /// When the disk refuses.
     pub fn finish(self) -> Result<(), ShardError> {
-        for (path, builder) in self.open.into_values() {
-            let temporary = path.with_extension("tar.part");
+        for open in self.open.into_values() {
+            let Open {
+                path,
+                temporary,
+                builder,
+            } = open;
             let writer = builder.into_inner().map_err(io(&temporary))?;
             let file = writer
                 .into_inner()
                 .map_err(|e| io(&temporary)(e.into_error()))?;
             file.sync_all().map_err(io(&temporary))?;
-            std::fs::rename(&temporary, &path).map_err(io(&path))?;
+            place::publish(&temporary, &path).map_err(io(&path))?;
         }
         Ok(())
     }
@@ -166,8 +203,8 @@ impl ShardIndex {
     /// When there are none, or a tar is damaged; the error names file, byte and reason.
     pub fn open(root: &Path) -> Result<Self, ShardError> {
         let mut found = Vec::new();
-        for modality in children(root)? {
-            if modality.is_dir() {
+        for (modality, is_folder) in place::entries(root).map_err(io(root))? {
+            if is_folder {
                 let name = file_name(&modality);
                 for path in tar::below(&modality, 3).map_err(|e| damaged(&modality, e))? {
                     let folder = path.parent().unwrap_or(&path);
@@ -251,14 +288,14 @@ impl ShardIndex {
             return Ok(None);
         };
         let path = &self.tars[place.tar as usize];
-        let mut file = File::open(path).map_err(io(path))?;
-        let bytes = place.member.read(&mut file).map_err(|error| {
-            if error.kind() == std::io::ErrorKind::UnexpectedEof {
-                self.member_error(sample, modality, "the file has become shorter")
-            } else {
-                io(path)(error)
-            }
-        })?;
+        let bytes = place::read_range(path, place.member.offset, place.member.size).map_err(io(path))?;
+        if bytes.len() as u64 != place.member.size {
+            return Err(ShardError::Member {
+                path: path.clone(),
+                member: stem.clone(),
+                reason: "the file has become shorter".to_owned(),
+            });
+        }
         Ok(Some(bytes))
     }
 
@@ -284,15 +321,6 @@ fn file_name(path: &Path) -> String {
         .unwrap_or_default()
         .to_string_lossy()
         .into_owned()
-}
-
-fn children(folder: &Path) -> Result<Vec<PathBuf>, ShardError> {
-    let mut paths = Vec::new();
-    for entry in std::fs::read_dir(folder).map_err(io(folder))? {
-        paths.push(entry.map_err(io(folder))?.path());
-    }
-    paths.sort();
-    Ok(paths)
 }
 
 /// What is wrong with a tar, or with a folder of them.

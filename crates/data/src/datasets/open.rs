@@ -9,6 +9,7 @@ use super::{
     ClipSource, Outcome, ReadError, adt, arctic, ego_exo4d, egogen, egom2p, h2o, holoassist, hot3d,
     hot3d_clips, mps, neutral, nymeria, taco,
 };
+use crate::formats::place;
 use crate::modality::{ClipFormat, DeclaredSettings};
 use crate::video::{Video, VideoSettings, folder};
 use std::path::Path;
@@ -35,6 +36,15 @@ pub fn open(
     settings: &CutSettings,
     with: OpenWith<'_>,
 ) -> Result<Arc<dyn ClipSource>, ReadError> {
+    if place::is_remote(path) {
+        return match kind {
+            None | Some(Dataset::Shards) => Ok(Arc::new(ShardClips::open(path)?)),
+            Some(_) => Err(ReadError::unsupported(
+                path,
+                "an address of an object store holds clips that were converted; recordings are read from a disk",
+            )),
+        };
+    }
     let Some(kind) = kind else {
         for kind in Dataset::ALL {
             match open(path, Some(kind), settings, with) {

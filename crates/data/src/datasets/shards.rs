@@ -10,9 +10,7 @@ use crate::clip::shard::ShardError;
 use crate::clip::store::{self, ClipSet};
 use crate::formats::FormatError;
 use crate::formats::read_error::Position;
-use crate::formats::tar;
-use crate::formats::text::read_json;
-use crate::formats::write_atomically;
+use crate::formats::{place, tar};
 use crate::modality::ClipFormat;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -94,7 +92,7 @@ impl Content {
     pub fn of(path: &Path) -> Result<Self, ReadError> {
         let fail = |cause| ReadError::io(path, cause);
         let mut hasher = blake3::Hasher::new();
-        let mut file = std::fs::File::open(path).map_err(fail)?;
+        let (mut file, _) = place::open(path, place::THROUGH).map_err(fail)?;
         let bytes = std::io::copy(&mut file, &mut hasher).map_err(fail)?;
         Ok(Content {
             bytes,
@@ -158,7 +156,7 @@ impl TarSink {
     /// When the disk refuses.
     pub fn new(root: &Path, markers: &Path) -> Result<Self, ReadError> {
         for folder in [root, markers] {
-            std::fs::create_dir_all(folder).map_err(|cause| ReadError::io(folder, cause))?;
+            place::make_folder(folder).map_err(|cause| ReadError::io(folder, cause))?;
         }
         Ok(TarSink {
             root: root.to_owned(),
@@ -173,7 +171,7 @@ impl TarSink {
     /// What is known of a finished shard; `None` when it has to be made.
     #[must_use]
     pub fn read_marker(&self, shard: usize) -> Option<Marker> {
-        let bytes = std::fs::read(self.marker(shard)).ok()?;
+        let bytes = place::read(&self.marker(shard)).ok()?;
         // Markers of version 1 were the tally alone.
         serde_json::from_slice(&bytes).ok().or_else(|| {
             Some(Marker {
@@ -208,14 +206,8 @@ impl ShardSink for TarSink {
             }
         }
         let tally = tally();
-        write_json(&self.marker(shard), &Marker { tally, files })
+        place::write_json(&self.marker(shard), &Marker { tally, files })
     }
-}
-
-fn write_json(path: &Path, value: &impl Serialize) -> Result<(), ReadError> {
-    let text =
-        serde_json::to_vec_pretty(value).map_err(|error| ReadError::Settings(error.to_string()))?;
-    Ok(write_atomically(path, &text)?)
 }
 
 /// A folder that a conversion fills.
@@ -232,7 +224,7 @@ impl Folder {
     /// When the folder holds something else, or the disk refuses.
     pub fn begin(root: &Path, header: Header) -> Result<Self, ReadError> {
         let file = root.join(FILE);
-        match std::fs::read(&file) {
+        match place::read(&file) {
             Ok(bytes) => {
                 let there: Header = serde_json::from_slice(&bytes).map_err(|error| {
                     ReadError::malformed(
@@ -250,18 +242,18 @@ impl Folder {
                 }
             }
             Err(error) if error.kind() == std::io::ErrorKind::NotFound => {
-                let empty =
-                    std::fs::read_dir(root).map_or(true, |mut inside| inside.next().is_none());
+                let fail = |cause| ReadError::io(root, cause);
+                let empty = place::is_empty(root).map_err(fail)?;
                 // Another process with a share of the same conversion may have begun in between.
-                if !empty && file.is_file() {
+                if !empty && place::is_file(&file).map_err(fail)? {
                     return Self::begin(root, header);
                 }
                 if !empty {
                     let reason = "is not empty and holds no converted clips; name another folder";
                     return Err(ReadError::unsupported(root, reason));
                 }
-                std::fs::create_dir_all(root).map_err(|cause| ReadError::io(root, cause))?;
-                write_json(&file, &header)?;
+                place::make_folder(root).map_err(fail)?;
+                place::write_json(&file, &header)?;
             }
             Err(error) => return Err(ReadError::io(&file, error)),
         }
@@ -285,7 +277,7 @@ impl Folder {
     /// When there is none, or it is damaged.
     pub fn header(root: &Path) -> Result<Header, ReadError> {
         let file = root.join(FILE);
-        let bytes = std::fs::read(&file).map_err(|cause| ReadError::io(&file, cause))?;
+        let bytes = place::read(&file).map_err(|cause| ReadError::io(&file, cause))?;
         serde_json::from_slice(&bytes).map_err(|error| {
             let line = Position::Line(error.line() as u64);
             ReadError::malformed(&file, line, error.to_string())
@@ -298,7 +290,7 @@ impl Folder {
     /// When the disk refuses.
     pub fn finish(mut self, tally: Tally) -> Result<(), ReadError> {
         self.header.tally = Some(tally);
-        write_json(&self.root.join(FILE), &self.header)
+        place::write_json(&self.root.join(FILE), &self.header)
     }
 }
 
@@ -320,11 +312,11 @@ impl ShardClips {
         let mut sets = Vec::new();
         for split in SPLITS {
             let folder = root.join(split);
-            if holds_shards(&folder) {
+            if holds_shards(&folder)? {
                 sets.push((split.to_owned(), ClipSet::open(&folder)?));
             }
         }
-        if sets.is_empty() && holds_shards(root) {
+        if sets.is_empty() && holds_shards(root)? {
             sets.push((String::new(), ClipSet::open(root)?));
         }
         let first = sets.first().ok_or_else(absent)?;
@@ -347,23 +339,26 @@ impl ShardClips {
     }
 }
 
-/// Whether `<modality>/<data set>/shard-*.tar` is below a folder.
-fn holds_shards(root: &Path) -> bool {
-    fn below(folder: &Path, depth: usize) -> bool {
-        let Ok(entries) = std::fs::read_dir(folder) else {
-            return false;
+/// Whether `<modality>/<data set>/shard-*.tar` is below a folder: not below one that cannot be listed, but a store has to answer.
+fn holds_shards(root: &Path) -> Result<bool, ReadError> {
+    fn below(folder: &Path, depth: usize) -> std::io::Result<bool> {
+        let entries = match place::entries(folder) {
+            Err(_) if !place::is_remote(folder) => return Ok(false),
+            entries => entries?,
         };
-        entries.flatten().any(|entry| {
-            let name = entry.file_name();
-            let shard = name.to_str().is_some_and(|name| {
+        for (path, is_folder) in entries {
+            let name = path.file_name().and_then(|name| name.to_str());
+            let shard = name.is_some_and(|name| {
                 name.starts_with("shard-")
                     && Path::new(name).extension().is_some_and(|e| e == "tar")
             });
-            (depth < 2 && shard)
-                || (depth > 0 && entry.path().is_dir() && below(&entry.path(), depth - 1))
-        })
+            if (depth < 2 && shard) || (depth > 0 && is_folder && below(&path, depth - 1)?) {
+                return Ok(true);
+            }
+        }
+        Ok(false)
     }
-    below(root, 2)
+    below(root, 2).map_err(|cause| ReadError::io(root, cause))
 }
 
 /// The sizes that the folder's own description, or that of the artifact it belongs to, speaks of.
@@ -375,10 +370,13 @@ fn described_format(root: &Path) -> Result<Option<ClipFormat>, ReadError> {
     let above = root.parent().map(|parent| parent.join("manifest.json"));
     let manifests = [Some(root.join("manifest.json")), above];
     let described = [Some(own.clone())].into_iter().chain(manifests).flatten();
-    let Some(path) = described.into_iter().find(|path| path.is_file()) else {
+    let Some(path) = described
+        .into_iter()
+        .find(|path| place::is_file(path).unwrap_or(false))
+    else {
         return Ok(None);
     };
-    let value: serde_json::Value = read_json(&path)?;
+    let value: serde_json::Value = place::read_json(&path)?;
     let format = if path == own {
         &value["format"]
     } else {

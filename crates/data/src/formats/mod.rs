@@ -1,13 +1,17 @@
 //! Container formats that carry arrays and pictures, read with bounded memory.
 //!
 //! Read in this order: [`zip`] (archives, also the shell of npz and of released checkpoints), [`npy`] (one array), [`npz`]
-//! (named arrays), [`pickle`] (an interpreter that can only describe data), [`png`] (pictures), [`tar`] (shards). Every reader takes untrusted
+//! (named arrays), [`pickle`] (an interpreter that can only describe data), [`png`] (pictures), [`place`] (where a file lies: on a disk,
+//! or in an object store), [`tar`] (shards). Every reader takes untrusted
 //! bytes: a malformed file is a [`FormatError`] that says where and why, a recording that cannot be read is a [`ReadError`], and
 //! no length field is believed before it has been compared with the size of the file.
 
 pub mod npy;
 pub mod npz;
+#[cfg(feature = "s3")]
+pub mod object;
 pub mod pickle;
+pub mod place;
 pub mod png;
 pub mod read_error;
 pub mod tar;

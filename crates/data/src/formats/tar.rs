@@ -1,8 +1,7 @@
 //! Tar archives, read in place: where their members lie. Opening one reads headers only, and no size is believed before it was
 //! compared with the length of the archive.
 
-use super::FormatError;
-use std::fs::File;
+use super::{FormatError, place};
 use std::io::{Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 
@@ -49,8 +48,7 @@ impl Member {
 /// When it cannot be read, is no tar, or ends before its last member does.
 pub fn headers(path: &Path) -> Result<Vec<Header>, FormatError> {
     let read = || {
-        let file = File::open(path)?;
-        let length = file.metadata()?.len();
+        let (file, length) = place::open(path, place::JUMPS)?;
         headers_of(std::io::BufReader::new(file), length)
     };
     read().map_err(|error: FormatError| error.in_file(path))
@@ -94,9 +92,8 @@ pub fn headers_of(archive: impl Read + Seek, length: u64) -> Result<Vec<Header>,
 pub fn below(folder: &Path, depth: usize) -> Result<Vec<PathBuf>, FormatError> {
     fn descend(folder: &Path, depth: usize, found: &mut Vec<PathBuf>) -> Result<(), FormatError> {
         let refuse = |error: std::io::Error| FormatError::from(error).in_file(folder);
-        for entry in std::fs::read_dir(folder).map_err(refuse)? {
-            let path = entry.map_err(refuse)?.path();
-            if path.is_dir() {
+        for (path, is_folder) in place::entries(folder).map_err(refuse)? {
+            if is_folder {
                 if depth > 0 {
                     descend(&path, depth - 1, found)?;
                 }
