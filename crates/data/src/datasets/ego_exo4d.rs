@@ -118,6 +118,12 @@ fn open(
                 return Err(ReadError::missing(&sync, reason));
             }
             recording.notes.extend(frames.note.map(str::to_owned));
+            if times.len() < timesync::rows_of(&rows) {
+                recording.notes.push(
+                    "`timesync.csv` ends before the take does: what was captured after it has no pictures"
+                        .to_owned(),
+                );
+            }
             recording.colour = Some(Box::new(TimedFrames {
                 frames: Frames {
                     video,

@@ -46,6 +46,11 @@ pub(super) fn read(
     Ok(times)
 }
 
+/// How many rows a take has, its exclusive end left out.
+pub(super) fn rows_of(rows: &Range<u64>) -> usize {
+    usize::try_from(rows.end - rows.start).unwrap_or(usize::MAX)
+}
+
 fn short(text: &str) -> String {
     text.chars().take(40).collect()
 }
@@ -62,7 +67,7 @@ pub(super) struct FrameRows {
 /// Gives `frames` frames of a video the times of their rows. The official tutorials begin at the row after the first and end before
 /// the last; takes whose video has one frame more begin at the first row: how many frames there are decides.
 pub(super) fn frames(frames: usize, rows: &Range<u64>, times: &[Option<i64>]) -> FrameRows {
-    let between = usize::try_from(rows.end - rows.start).unwrap_or(usize::MAX);
+    let between = rows_of(rows);
     let (first, note) = if frames >= between {
         let note = (frames > between)
             .then_some("the video has more frames than the take has rows in `timesync.csv`: its end has no pictures");
