@@ -206,8 +206,8 @@ impl Builder {
         });
         let (tracks, boundaries) = std::mem::replace(&mut self.stitcher, fresh).finish();
         let feet = foot_heights(&tracks);
-        let floor = floor_height(&feet, self.info.floor_fit.rule).ok();
-        let (scale, fit, refused) = self.fit_scale(&tracks, floor);
+        let floor = floor_height(&feet, self.info.floor_fit.rule);
+        let (scale, fit, refused) = self.fit_scale(&tracks, floor.clone());
         if let Some(fit) = &fit {
             for grid in &mut self.grids {
                 grid.mapv_inplace(|d| fit.apply(d));
@@ -231,7 +231,7 @@ impl Builder {
             video: self.video,
             grids: self.grids,
             cloud,
-            floor,
+            floor: floor.ok(),
         })
     }
 
@@ -248,7 +248,7 @@ impl Builder {
     fn fit_scale(
         &self,
         tracks: &Tracks,
-        floor: Option<f64>,
+        floor: Result<f64, ScaleRefusal>,
     ) -> (ScaleStatus, Option<DepthFit>, Option<String>) {
         if self.grids.is_empty() {
             return (ScaleStatus::None, None, None);
@@ -261,7 +261,10 @@ impl Builder {
             }
             None if tracks.camera().is_empty() => ("floor fit", Err(ScaleRefusal::NoCamera)),
             None if tracks.body().is_empty() => ("floor fit", Err(ScaleRefusal::NoBody)),
-            None => ("floor fit", self.fit_to_floor(tracks, floor)),
+            None => (
+                "floor fit",
+                floor.and_then(|floor| self.fit_to_floor(tracks, floor)),
+            ),
         };
         match fit {
             Ok(fit) => (ScaleStatus::Metric { by: by.into() }, Some(fit), None),
@@ -274,8 +277,7 @@ impl Builder {
         self.coding.is_some_and(|c| c.range == DepthRange::Fixed)
     }
 
-    fn fit_to_floor(&self, tracks: &Tracks, floor: Option<f64>) -> Result<DepthFit, ScaleRefusal> {
-        let floor = floor.ok_or(ScaleRefusal::NoFeet { found: 0 })?;
+    fn fit_to_floor(&self, tracks: &Tracks, floor: f64) -> Result<DepthFit, ScaleRefusal> {
         let mut views = Vec::new();
         for (frame, grid) in self.grids.iter().enumerate().step_by(self.stride()) {
             let sample = self.sample_of(frame, tracks.camera().len());
