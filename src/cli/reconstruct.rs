@@ -143,7 +143,8 @@ impl super::Run for Reconstruct {
         let manifest = Manifest::read(&made).map_err(Failure::machine)?;
         publish(&made, &target).map_err(|error| tell(terminal, &error))?;
         self.write_more(terminal, &outcome, &target)?;
-        Self::report(terminal, &outcome, &manifest, &target)
+        Self::report(terminal, &outcome, &manifest, &target);
+        Ok(())
     }
 }
 
@@ -246,12 +247,7 @@ impl Reconstruct {
     }
 
     /// What was made, what was assumed, and where the time went.
-    fn report(
-        terminal: &Terminal,
-        outcome: &Outcome,
-        manifest: &Manifest,
-        target: &Path,
-    ) -> Result<(), Failure> {
+    fn report(terminal: &Terminal, outcome: &Outcome, manifest: &Manifest, target: &Path) {
         let mut text = String::from("\n");
         for [label, value] in &manifest.assumptions {
             let _ = writeln!(text, "{label:<12}{value}");
@@ -283,7 +279,6 @@ impl Reconstruct {
         }
         terminal.note(text);
         terminal.data(format_args!("{}\n", target.join(PAGE).display()));
-        Ok(())
     }
 }
 
