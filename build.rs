@@ -5,14 +5,29 @@ use std::path::{Path, PathBuf};
 
 fn main() {
     let root = PathBuf::from(std::env::var("CARGO_MANIFEST_DIR").expect("cargo sets it"));
-    let is_yaml = |file: &Path| file.extension().is_some_and(|extension| extension == "yaml");
+    let is_yaml = |file: &Path| {
+        file.extension()
+            .is_some_and(|extension| extension == "yaml")
+    };
     let mut texts = String::new();
     for (folder, name) in [("registry", "REGISTRY"), ("experiments", "EXPERIMENTS")] {
-        texts += &table(&root, &root.join(folder), name, ("str", "include_str"), is_yaml);
+        texts += &table(
+            &root,
+            &root.join(folder),
+            name,
+            ("str", "include_str"),
+            is_yaml,
+        );
     }
     let world = root.join("models/world");
     let is_of_the_model = |file: &Path| !file.starts_with(world.join("record"));
-    let model = table(&world, &world, "WORLD", ("[u8]", "include_bytes"), is_of_the_model);
+    let model = table(
+        &world,
+        &world,
+        "WORLD",
+        ("[u8]", "include_bytes"),
+        is_of_the_model,
+    );
     let out = PathBuf::from(std::env::var("OUT_DIR").expect("cargo sets it"));
     for (file, code) in [("embedded.rs", texts), ("model.rs", model)] {
         std::fs::write(out.join(file), code).expect("the build directory can be written");

@@ -65,7 +65,7 @@ fn run<const N: usize>(arguments: [&OsStr; N]) -> Result<Output, Failure> {
 fn reason(said: &str) -> &str {
     let lines = || said.lines().map(str::trim).filter(|line| !line.is_empty());
     let own = lines().find_map(|line| line.strip_prefix("error: "));
-    own.or_else(|| lines().last()).unwrap_or("it failed")
+    own.or_else(|| lines().next_back()).unwrap_or("it failed")
 }
 
 #[cfg(test)]

@@ -1,6 +1,6 @@
 //! Where a stage computes.
 
-use crate::engine::compute::out_of_memory;
+use crate::engine::compute::OutOfMemory;
 use crate::engine::{Communicator, Compute, DeviceChoice, DeviceKind, Precision};
 use crate::experiment::{Code, StageContext, StageError};
 
@@ -34,8 +34,8 @@ pub(super) fn compute(
 
 /// What a panic of the tensor library with this text says, where it says that a device's memory is full; `lower` is what to lower.
 pub(super) fn memory_is_full(text: &str, lower: &str) -> Option<StageError> {
-    let bytes = out_of_memory(text)?;
-    let asked = bytes.map_or_else(String::new, |bytes| {
+    let full = OutOfMemory::said(text)?;
+    let asked = full.bytes.map_or_else(String::new, |bytes| {
         format!(" for an array of {:.2} GB more", bytes as f64 / 1e9)
     });
     Some(StageError::Input {

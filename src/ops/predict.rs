@@ -19,7 +19,7 @@ use crate::masking::PIXELS;
 use crate::mget::MgetSpec;
 use crate::model::{GenerationRequest, Model, ModelError};
 use crate::reconstruction::predictions::{
-    RECONSTRUCTION_BOUND, PredictedClip, PredictionsWriter, ScaleStatus, SignalNote, sample_folder,
+    PredictedClip, PredictionsWriter, RECONSTRUCTION_BOUND, ScaleStatus, SignalNote, sample_folder,
 };
 use crate::run::environment::Stopwatch;
 use schemars::JsonSchema;

@@ -148,7 +148,10 @@ impl Normaliser {
             if self.root_relative {
                 let (root, others) = sample.split_at_mut(AXES.min(sample.len()));
                 for joint in others.chunks_mut(AXES) {
-                    joint.iter_mut().zip(&*root).for_each(|(x, root)| *x -= root);
+                    joint
+                        .iter_mut()
+                        .zip(&*root)
+                        .for_each(|(x, root)| *x -= root);
                 }
             }
             for ((value, mean), deviation) in sample.iter_mut().zip(&self.mean).zip(&self.deviation)
@@ -168,7 +171,10 @@ impl Normaliser {
             if self.root_relative {
                 let (root, others) = sample.split_at_mut(AXES.min(sample.len()));
                 for joint in others.chunks_mut(AXES) {
-                    joint.iter_mut().zip(&*root).for_each(|(x, root)| *x += root);
+                    joint
+                        .iter_mut()
+                        .zip(&*root)
+                        .for_each(|(x, root)| *x += root);
                 }
             }
         }
@@ -203,7 +209,10 @@ mod tests {
     #[test]
     fn joints_seen_from_the_root_come_back_and_count_only_where_it_is_valid() {
         // Three samples of a root and one joint, one metre above it; in the last sample the root is not valid.
-        let values = [0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 4.0, 2.0, 0.0, 4.0, 3.2, 0.0, 9.0, 9.0, 9.0, 5.0, 5.0, 5.0];
+        let values = [
+            0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 4.0, 2.0, 0.0, 4.0, 3.2, 0.0, 9.0, 9.0, 9.0, 5.0, 5.0,
+            5.0,
+        ];
         let shape = ArrayD::from_shape_vec(IxDyn(&[3, 2, 3]), values.to_vec()).unwrap();
         let valid = vec![true, true, true, true, false, true];
         let valid = ArrayD::from_shape_vec(IxDyn(&[3, 2]), valid).unwrap();
@@ -222,7 +231,12 @@ mod tests {
         for (found, expected) in there.iter().zip(&values) {
             assert!((found - expected).abs() < 1e-6);
         }
-        assert!(Normaliser::constant(2, 0.5, 0.5).unwrap().of_joints(true).is_err());
+        assert!(
+            Normaliser::constant(2, 0.5, 0.5)
+                .unwrap()
+                .of_joints(true)
+                .is_err()
+        );
     }
 
     #[test]

@@ -305,7 +305,9 @@ pub fn prepare(
         if let Some(valid) = valid.as_mut().filter(|_| normaliser.is_root_relative()) {
             for sample in valid.chunks_mut(normaliser.width() / channels) {
                 let root = sample.first().is_some_and(|valid| *valid);
-                sample.iter_mut().for_each(|valid| *valid &= root);
+                for valid in sample {
+                    *valid &= root;
+                }
             }
         }
         normaliser.apply(&mut values);

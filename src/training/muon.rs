@@ -111,7 +111,10 @@ mod tests {
         assert_eq!(matrices("decoder.0.cross.kv.weight", &[24, 12]), Some(2));
         assert_eq!(matrices("encoder.0.mlp.fc1.weight", &[32, 12]), Some(1));
         assert_eq!(matrices("encoder.0.norm1.weight", &[12]), None);
-        assert_eq!(matrices("encoder_embeddings.rgb.token_emb.weight", &[9, 4]), None);
+        assert_eq!(
+            matrices("encoder_embeddings.rgb.token_emb.weight", &[9, 4]),
+            None
+        );
         assert_eq!(matrices("down.0.conv.weight", &[4, 4, 3, 3, 3]), None);
     }
 }

@@ -35,9 +35,11 @@ pub struct AdamWSettings {
     pub clip_norm: Option<f64>,
     /// Of several ranks each keeps its share of the optimizer's two moments and no more (ZeRO stage 1): less memory, one more
     /// exchange of all weights a step, and the same bytes. One rank keeps everything.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub shard: bool,
     /// Muon for the matrices inside blocks: their momentum is made orthogonal first. Everything else steps as before. Not with `shard`:
     /// the step of a matrix needs all of it.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub muon: bool,
 }
 
@@ -120,8 +122,7 @@ impl AdamW {
         model.visit("", &mut |name, parameter| {
             if parameter.kind() == Kind::Trainable {
                 let zeros = parameter.untracked().zeros_like();
-                let with_muon =
-                    settings.muon && muon::matrices(name, parameter.shape()).is_some();
+                let with_muon = settings.muon && muon::matrices(name, parameter.shape()).is_some();
                 let pair = Moments {
                     mean: zeros.clone(),
                     square: (!with_muon).then_some(zeros),
@@ -330,11 +331,11 @@ impl AdamW {
             values: Values::I64(vec![self.step as i64]),
         };
         weights.tensors.insert("step".to_owned(), step);
-        let kinds: [(&str, fn(&Moments) -> Option<&Tensor<1>>); 2] = [
-            ("exp_avg", |m| Some(&m.mean)),
-            ("exp_avg_sq", |m| m.square.as_ref()),
-        ];
-        for (kind, of) in kinds {
+        for kind in ["exp_avg", "exp_avg_sq"] {
+            let of = |moments: &Moments| match kind {
+                "exp_avg" => Some(to_host(moments.mean.clone())),
+                _ => moments.square.clone().map(to_host),
+            };
             let mut insert = |name: &str, values: Vec<f32>| {
                 let length = values.len();
                 weights.insert_f32(&format!("{kind}.{name}"), values, &[length]);
@@ -342,7 +343,7 @@ impl AdamW {
             let Some(shard) = &self.shard else {
                 for (name, moments) in &self.moments {
                     if let Some(values) = of(moments) {
-                        insert(name, to_host(values.clone()));
+                        insert(name, values);
                     }
                 }
                 continue;
@@ -350,7 +351,6 @@ impl AdamW {
             let mut mine = vec![0.0; shard.stretch()];
             for (name, moments) in &self.moments {
                 if let (Some((own, at)), Some(values)) = (shard.own(name), of(moments)) {
-                    let values = to_host(values.clone());
                     mine[at..at + own.len()].copy_from_slice(&values);
                 }
             }
@@ -371,19 +371,15 @@ impl AdamW {
     /// When the state is of another model.
     pub fn restore(&mut self, state: &Weights) -> Result<(), EngineError> {
         let step = state.get("step", &[1])?.i64("step")?[0];
-        let names: Vec<(String, usize)> = match &self.shard {
-            Some(shard) => {
-                let names = shard.names();
-                names
-                    .map(|(name, length)| (name.to_owned(), length))
-                    .collect()
-            }
-            None => {
-                let all = self.moments.iter();
-                let length = |moments: &Moments| moments.mean.dims()[0];
-                all.map(|(name, moments)| (name.clone(), length(moments)))
-                    .collect()
-            }
+        let names: Vec<(String, usize)> = if let Some(shard) = &self.shard {
+            let names = shard.names();
+            names
+                .map(|(name, length)| (name.to_owned(), length))
+                .collect()
+        } else {
+            let all = self.moments.iter();
+            all.map(|(name, moments)| (name.clone(), moments.mean.dims()[0]))
+                .collect()
         };
         let mut restored = BTreeMap::new();
         let mut arrays = 1;

@@ -303,7 +303,10 @@ mod tests {
         for blocks in [0, 2, 4] {
             std::fs::write(&path, &bytes[..blocks * 512]).unwrap();
             let error = TokenShards::open(folder.path(), "set", &spec()).unwrap_err();
-            assert!(error.to_string().contains(crate::formats::TAR_CUT), "{blocks}: {error}");
+            assert!(
+                error.to_string().contains(crate::formats::TAR_CUT),
+                "{blocks}: {error}"
+            );
         }
     }
 

@@ -412,6 +412,10 @@ impl TokenizerOptions {
             velocity_weight: 50.0,
             ..VqSettings::temporal_small()
         };
+        let body = VqSettings {
+            root_relative: true,
+            ..VqSettings::kinematic_small()
+        };
         let tokenizers = [
             (
                 "rgb",
@@ -430,8 +434,8 @@ impl TokenizerOptions {
             ),
             (
                 "body",
-                TokenizerSettings::Vq(VqSettings::kinematic_small()),
-                training(700, 8, 2e-3, 20),
+                TokenizerSettings::Vq(body),
+                training(1200, 16, 2e-3, 20),
             ),
         ];
         let tokenizers = tokenizers.into_iter();

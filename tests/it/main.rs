@@ -1,5 +1,9 @@
 //! One integration test binary, a file per command or promise.
 #![allow(clippy::unwrap_used)] // A test that cannot go on should stop where it is.
+#![allow(
+    clippy::duplicate_mod,
+    reason = "examples that the tests run share a folder"
+)]
 
 mod adt_evaluation;
 mod bad_input;

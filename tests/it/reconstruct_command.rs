@@ -339,7 +339,13 @@ fn without_a_model_and_a_run_the_one_that_comes_with_the_program_is_used_and_say
     let said = String::from_utf8_lossy(&said.get_output().stderr).into_owned();
     assert!(said.contains("models/world-"), "{said}");
     assert!(said.contains("synthetic"), "{said}");
-    for name in ["camera.npz", "body.npz", "hands.npz", "gaze.npz", "depth.npz"] {
+    for name in [
+        "camera.npz",
+        "body.npz",
+        "hands.npz",
+        "gaze.npz",
+        "depth.npz",
+    ] {
         assert!(place.path("out").join(name).is_file(), "{name} is missing");
     }
 }

@@ -175,10 +175,14 @@ impl VqSettings {
         }
         if !matches!(shape, Shape::Kinematic { .. }) {
             if self.pose_weight > 0.0 {
-                return wrong("pose_weight is for joints; a signal over time has no pose".to_owned());
+                return wrong(
+                    "pose_weight is for joints; a signal over time has no pose".to_owned(),
+                );
             }
             if self.root_relative {
-                return wrong("root_relative is for joints; a signal over time has no root".to_owned());
+                return wrong(
+                    "root_relative is for joints; a signal over time has no root".to_owned(),
+                );
             }
         }
         Patches::new(shape, &self.compression)

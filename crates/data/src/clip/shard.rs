@@ -288,7 +288,8 @@ impl ShardIndex {
             return Ok(None);
         };
         let path = &self.tars[place.tar as usize];
-        let bytes = place::read_range(path, place.member.offset, place.member.size).map_err(io(path))?;
+        let bytes =
+            place::read_range(path, place.member.offset, place.member.size).map_err(io(path))?;
         if bytes.len() as u64 != place.member.size {
             return Err(ShardError::Member {
                 path: path.clone(),

@@ -296,25 +296,31 @@ impl Compute {
     }
 }
 
-/// Whether a panic of the tensor library with this text says that a device's memory is full, and how many bytes were asked for, where it
-/// says that: the library hands such errors on as panics alone.
-#[must_use]
-pub fn out_of_memory(text: &str) -> Option<Option<u64>> {
-    // As `cubecl` 0.11 writes its errors.
-    let asked = [
-        "out of device memory allocating ",
-        "can't allocate buffer of size: ",
-        "Can't allocate ",
-    ];
-    let number = |text: &str| {
-        let digits = text.split(|c: char| !c.is_ascii_digit()).next()?;
-        digits.parse().ok()
-    };
-    let found = asked.iter().find_map(|start| text.split_once(start));
-    let full = text.contains("out-of-memory error happened");
-    match found {
-        Some((_, rest)) => Some(number(rest)),
-        None => full.then_some(None),
+/// A device's memory is full.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct OutOfMemory {
+    /// What was asked for, where that is known.
+    pub bytes: Option<u64>,
+}
+
+impl OutOfMemory {
+    /// Whether a panic of the tensor library with this text says so: the library hands such errors on as panics alone.
+    #[must_use]
+    pub fn said(text: &str) -> Option<Self> {
+        // As `cubecl` 0.11 writes its errors.
+        let asked = [
+            "out of device memory allocating ",
+            "can't allocate buffer of size: ",
+            "Can't allocate ",
+        ];
+        let number = |text: &str| {
+            let digits = text.split(|c: char| !c.is_ascii_digit()).next()?;
+            digits.parse().ok()
+        };
+        let found = asked.iter().find_map(|start| text.split_once(start));
+        let full = text.contains("out-of-memory error happened");
+        let bytes = found.and_then(|(_, rest)| number(rest));
+        (full || found.is_some()).then_some(Self { bytes })
     }
 }
 
@@ -433,9 +439,13 @@ mod tests {
                 None,
             ),
         ] {
-            assert_eq!(out_of_memory(text), Some(bytes), "{text}");
+            assert_eq!(
+                OutOfMemory::said(text),
+                Some(OutOfMemory { bytes }),
+                "{text}"
+            );
         }
-        assert_eq!(out_of_memory("a loss of memory"), None);
+        assert_eq!(OutOfMemory::said("a loss of memory"), None);
     }
 
     #[test]
