@@ -20,7 +20,8 @@ fn main() {
         );
     }
     let world = root.join("models/world");
-    let is_of_the_model = |file: &Path| !file.starts_with(world.join("record"));
+    let is_of_the_model =
+        |file: &Path| !file.starts_with(world.join("record")) && !file.ends_with("README.md");
     let model = table(
         &world,
         &world,
