@@ -416,27 +416,13 @@ impl TokenizerOptions {
             root_relative: true,
             ..VqSettings::kinematic_small()
         };
+        let (vq, gaze) = (TokenizerSettings::Vq, VqSettings::temporal_small());
+        let video = TokenizerSettings::Video(VideoSettings::tiny());
         let tokenizers = [
-            (
-                "rgb",
-                TokenizerSettings::Video(VideoSettings::tiny()),
-                training(150, 2, 2e-3, 10),
-            ),
-            (
-                "camera",
-                TokenizerSettings::Vq(camera),
-                training(1200, 16, 3e-3, 20),
-            ),
-            (
-                "gaze",
-                TokenizerSettings::Vq(VqSettings::temporal_small()),
-                training(600, 16, 3e-3, 20),
-            ),
-            (
-                "body",
-                TokenizerSettings::Vq(body),
-                training(1200, 16, 2e-3, 20),
-            ),
+            ("rgb", video, training(150, 2, 2e-3, 10)),
+            ("camera", vq(camera), training(1200, 16, 3e-3, 20)),
+            ("gaze", vq(gaze), training(600, 16, 3e-3, 20)),
+            ("body", vq(body), training(1200, 16, 2e-3, 20)),
         ];
         let tokenizers = tokenizers.into_iter();
         Self {
