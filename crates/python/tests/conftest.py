@@ -10,17 +10,8 @@ import numpy as np
 import pytest
 import reviv
 
-EXPERIMENT = """
-experiment: tiny
-about: As quickstart, in seconds; nothing is learned.
-seed: 0
-stages:
-  clips: {op: clips, source: world_small, train: 6, validation: 2, test: 3}
-  tok_camera: {op: train_tokenizer, clips: clips, modality: camera, tokenizer: vq_temporal_small, steps: 2, batch: 2, warmup: {steps: 0}}
-  tok_gaze: {op: train_tokenizer, clips: clips, modality: gaze, tokenizer: vq_temporal_small, steps: 2, batch: 2, warmup: {steps: 0}}
-  tok_body: {op: train_tokenizer, clips: clips, modality: body, tokenizer: vq_kinematic_small, steps: 2, batch: 2, warmup: {steps: 0}}
-  tok_hand: {op: train_tokenizer, clips: clips, modality: left_hand, tokenizer: vq_kinematic_small, steps: 2, batch: 2, warmup: {steps: 0}}
-  tokens: {op: tokenize, clips: clips, tokenizers: [tok_camera, tok_gaze, tok_body, tok_hand], pixels: rgb}
+# The smallest transformer, on tokens of a stage of that name.
+MGET = """\
   mget:
     op: train_mget
     tokens: [tokens]
@@ -32,7 +23,20 @@ stages:
     steps: 2
     batch: 2
     warmup: {steps: 0}
-  predictions: {op: predict, model: mget, clips: clips, inputs: [pixels], decoding: fast, split: test}
+"""
+
+EXPERIMENT = """
+experiment: tiny
+about: As quickstart, in seconds; nothing is learned.
+seed: 0
+stages:
+  clips: {op: clips, source: world_small, train: 6, validation: 2, test: 3}
+  tok_camera: {op: train_tokenizer, clips: clips, modality: camera, tokenizer: vq_temporal_small, steps: 2, batch: 2, warmup: {steps: 0}}
+  tok_gaze: {op: train_tokenizer, clips: clips, modality: gaze, tokenizer: vq_temporal_small, steps: 2, batch: 2, warmup: {steps: 0}}
+  tok_body: {op: train_tokenizer, clips: clips, modality: body, tokenizer: vq_kinematic_small, steps: 2, batch: 2, warmup: {steps: 0}}
+  tok_hand: {op: train_tokenizer, clips: clips, modality: left_hand, tokenizer: vq_kinematic_small, steps: 2, batch: 2, warmup: {steps: 0}}
+  tokens: {op: tokenize, clips: clips, tokenizers: [tok_camera, tok_gaze, tok_body, tok_hand], pixels: rgb}
+""" + MGET + """  predictions: {op: predict, model: mget, clips: clips, inputs: [pixels], decoding: fast, split: test}
   scores: {op: evaluate, predictions: predictions, clips: clips, suite: {use: world_all, metrics: [body.ga_mpjpe, camera.rte]}, split: test}
 """
 
@@ -78,18 +82,7 @@ stages:
   tok_camera: {op: train_tokenizer, clips: clips, modality: camera, tokenizer: vq_temporal_small, steps: 2, batch: 2, warmup: {steps: 0}}
   tok_depth: {op: train_tokenizer, clips: clips, modality: depth, tokenizer: {use: video_tiny, channels: 4}, steps: 2, batch: 2, warmup: {steps: 0}}
   tokens: {op: tokenize, clips: clips, tokenizers: [tok_camera, tok_depth], pixels: rgb}
-  mget:
-    op: train_mget
-    tokens: [tokens]
-    size: {use: laptop_small, width: 48, heads: 2, encoder_depth: 1, decoder_depth: 1}
-    masking: {use: dirichlet, input_tokens: 32, target_tokens: 32}
-    positions: aligned
-    pixels: rgb
-    tubelet: [4, 16, 16]
-    steps: 2
-    batch: 2
-    warmup: {steps: 0}
-"""
+""" + MGET
 
 
 @pytest.fixture(scope="session")
