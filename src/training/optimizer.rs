@@ -14,7 +14,7 @@ use serde::{Deserialize, Serialize};
 
 use super::muon;
 use crate::engine::communicator::shard::Shard;
-use crate::engine::ops::{self, AdamWStep, Norm};
+use crate::engine::ops::{self, AdamWStep, MuonParameter, Norm};
 use crate::engine::parameters::{Kind, to_host};
 use crate::engine::{
     Communicator, Device, EngineError, Gradients, HostTensor, Parameters, RankError, Values,
@@ -186,15 +186,12 @@ impl AdamW {
         rate: f64,
     ) -> Result<f64, NotFinite> {
         let mut norm = gradients.norm();
-        if self.settings.muon {
-            // Its step on a device does not refuse itself.
+        if self.settings.muon || self.shard.is_some() {
+            // Muon's step on a device does not refuse itself, and what a share has moved is told to the other ranks at once.
             norm = Norm::Host(norm.read());
         }
-        if let Some(norm) = norm.known().filter(|norm| !norm.is_finite()) {
-            return Err(NotFinite {
-                step: self.step + 1,
-                norm,
-            });
+        if let Some(norm) = norm.known() {
+            self.check(norm)?;
         }
         self.step += 1;
         let settings = &self.settings;
@@ -216,15 +213,6 @@ impl AdamW {
         };
         let moments = &mut self.moments;
         if let Some(shard) = &self.shard {
-            // A device refuses a step by itself, but what it would have to tell is read anyway.
-            let norm_now = norm.read();
-            if !norm_now.is_finite() {
-                self.step -= 1;
-                return Err(NotFinite {
-                    step: self.step + 1,
-                    norm: norm_now,
-                });
-            }
             self.moved = vec![0.0; shard.stretch()];
             let moved = &mut self.moved;
             model.visit("", &mut |name, parameter| {
@@ -249,8 +237,9 @@ impl AdamW {
                 let square = Some(square);
                 moments.insert(name.to_owned(), Moments { mean, square });
             });
-            return Ok(norm_now);
+            return Ok(norm.read());
         }
+        let (mut with_muon, mut names) = (Vec::new(), Vec::new());
         model.visit_mut("", &mut |name, parameter| {
             let Some(state) = moments.remove(name) else {
                 return;
@@ -260,43 +249,55 @@ impl AdamW {
                 .expect("one gradient per trainable parameter");
             step.decay = decay(name);
             let tracked = parameter.is_tracked();
-            let moved = if let Some(square) = state.square {
+            if let Some(square) = state.square {
                 let (values, mean, square) =
                     ops::adamw(parameter.take(), gradient, state.mean, square, &norm, step);
                 parameter.put(values, tracked);
-                Moments {
-                    mean,
-                    square: Some(square),
-                }
-            } else {
-                let &[rows, columns] = parameter.shape() else {
-                    unreachable!("Muon is for matrices");
-                };
-                let stacked = muon::matrices(name, &[rows, columns]).unwrap_or(1);
-                let (values, mean) = muon::step(
-                    parameter.take(),
-                    gradient,
-                    state.mean,
-                    [rows, columns],
-                    stacked,
-                    rate,
-                    step.decay,
-                );
-                parameter.put(values, tracked);
-                Moments { mean, square: None }
+                let square = Some(square);
+                moments.insert(name.to_owned(), Moments { mean, square });
+                return;
+            }
+            let &[rows, columns] = parameter.shape() else {
+                unreachable!("Muon is for matrices");
             };
-            moments.insert(name.to_owned(), moved);
+            names.push((name.to_owned(), tracked));
+            with_muon.push(MuonParameter {
+                shape: [rows, columns],
+                matrices: muon::matrices(name, &[rows, columns]).unwrap_or(1),
+                values: parameter.take(),
+                gradient,
+                momentum: state.mean,
+                decay: step.decay,
+            });
+        });
+        // All at once, since a matrix alone is too small for several threads.
+        let moved = names.into_iter().zip(ops::muon(with_muon, rate));
+        let mut moved: BTreeMap<_, _> = moved
+            .map(|((name, tracked), after)| (name, (tracked, after)))
+            .collect();
+        model.visit_mut("", &mut |name, parameter| {
+            if let Some((tracked, (values, mean))) = moved.remove(name) {
+                parameter.put(values, tracked);
+                moments.insert(name.to_owned(), Moments { mean, square: None });
+            }
         });
         // On a device the step has refused itself; nobody has waited for it so far.
         let norm = norm.read();
-        if !norm.is_finite() {
-            self.step -= 1;
-            return Err(NotFinite {
-                step: self.step + 1,
-                norm,
-            });
-        }
+        self.step -= 1;
+        self.check(norm)?;
+        self.step += 1;
         Ok(norm)
+    }
+
+    /// Refuses the next step where the norm of its gradient is not finite.
+    fn check(&self, norm: f64) -> Result<(), NotFinite> {
+        if norm.is_finite() {
+            return Ok(());
+        }
+        Err(NotFinite {
+            step: self.step + 1,
+            norm,
+        })
     }
 
     /// Ends a step where the state is sharded: every rank gets from all what they have moved. Does nothing where it is not.
@@ -319,8 +320,8 @@ impl AdamW {
         Ok(())
     }
 
-    /// The state as arrays: `step`, `exp_avg.<name>` and, where Muon does not step, `exp_avg_sq.<name>`, the same however many ranks share it. Where it is sharded, all
-    /// ranks must ask at once, and rank 0 alone gets it; the others get `None`.
+    /// The state as arrays: `step`, `exp_avg.<name>` and, where Muon does not step, `exp_avg_sq.<name>`, the same however many ranks
+    /// share it. Where it is sharded, all ranks must ask at once, and rank 0 alone gets it; the others get `None`.
     ///
     /// # Errors
     /// When a rank is lost.

@@ -7,12 +7,14 @@ mod conv_window;
 mod fused;
 #[cfg(feature = "kernels")]
 mod gpu;
+mod muon;
 mod nearest;
 mod resize;
 mod unfused;
 mod vector;
 
 pub use conv_window::ConvWindow;
+pub use muon::{MuonParameter, muon};
 pub use nearest::nearest;
 pub use resize::{Resize, Step, steps};
 /// Matrix products on slices of the host.

@@ -11,7 +11,7 @@ use super::{Array, vector};
 /// Elements per task.
 const ELEMENTS: usize = 16 * 1024;
 
-fn host(tensor: Tensor<1>) -> FlexTensor {
+pub(super) fn host(tensor: Tensor<1>) -> FlexTensor {
     tensor
         .try_into_primitive::<Flex>()
         .expect("the front door lets only arrays of the CPU in")

@@ -12,6 +12,7 @@ mod flat;
 mod frame_norm;
 mod layer_norm;
 mod linear;
+mod muon;
 mod resize;
 
 use std::mem::MaybeUninit;
@@ -26,6 +27,7 @@ use burn_autodiff::ops::{Backward, Ops, OpsKind};
 use burn_flex::FlexTensor;
 
 pub use flat::{adamw, sum_of_squares};
+pub use muon::muon;
 
 use super::super::Segments;
 use super::{ConvWindow, Resize, vector};
