@@ -1,6 +1,7 @@
 //! `reviv import`: released weights of others into our safetensors; and what `reviv show FILE` says of a checkpoint.
 
 use super::terminal::{Failure, Terminal};
+use crate::formats::checkpoint::CheckpointError;
 use crate::formats::text::of_path;
 use crate::import::cosmos::parse_compression;
 use crate::import::{Checkpoint, ImportError, ImportOptions, import};
@@ -104,7 +105,7 @@ fn parse_clip(text: &str) -> Option<[usize; 3]> {
 
 /// Lists the entries of a checkpoint, without loading them.
 pub(super) fn show(path: &Path, as_json: bool, terminal: &Terminal) -> Result<(), Failure> {
-    let checkpoint = Checkpoint::open(path).map_err(failure)?;
+    let checkpoint = Checkpoint::open(path).map_err(|error| failure(error.into()))?;
     let entries = checkpoint.entries();
     let same = |index: Option<usize>| index.map(|i| entries[i].name.as_str());
     if as_json {
@@ -151,7 +152,9 @@ pub(super) fn show(path: &Path, as_json: bool, terminal: &Terminal) -> Result<()
 
 fn failure(error: ImportError) -> Failure {
     match error {
-        ImportError::Io { .. } => Failure::machine(error),
+        ImportError::Io { .. } | ImportError::Checkpoint(CheckpointError::Io { .. }) => {
+            Failure::machine(error)
+        }
         other => Failure::input(other.to_string(), ""),
     }
 }

@@ -1,14 +1,13 @@
 //! Weights released by others, read without executing anything and checked before anything is dropped.
 //!
-//! Read in this order: [`checkpoint`] (the entries of a `.pth`, a TorchScript archive or a safetensors file, streamed; its
-//! pickles are read by [`crate::formats::pickle`], an interpreter that can only describe data), [`rules`] (what may happen to an entry), [`mget`], [`vq`],
+//! Read in this order: [`crate::formats::checkpoint`] (the entries of a `.pth`, a TorchScript archive or a safetensors file, streamed; its
+//! pickles are read by an interpreter that can only describe data), [`rules`] (what may happen to an entry), [`mget`], [`vq`],
 //! [`cosmos`], [`vda`] and [`tmr`] (which rule applies to which name of which release), [`statistics`] (normalisation files that travel with the
 //! weights), `source` (one file, checked), `part` (one model of one or several files), `folder` (what our files of it are)
 //! and [`convert`] (the whole import, and the manifest).
 //!
 //! Weights are never part of this product: users get them from their authors, under their authors' licences.
 
-pub mod checkpoint;
 pub mod convert;
 pub mod cosmos;
 mod folder;
@@ -22,9 +21,10 @@ pub mod tmr;
 pub mod vda;
 pub mod vq;
 
-pub use checkpoint::{Checkpoint, Entry, Format};
+pub use crate::formats::checkpoint::{Checkpoint, Entry, Format};
 pub use convert::{ImportOptions, ImportReport, PartReport, import};
 
+use crate::formats::checkpoint::CheckpointError;
 use std::path::{Path, PathBuf};
 
 /// Why a file cannot be imported.
@@ -38,7 +38,10 @@ pub enum ImportError {
         /// What is wrong, in words.
         reason: String,
     },
-    /// A container, an array or a pickle does not follow its format.
+    /// A checkpoint cannot be read.
+    #[error(transparent)]
+    Checkpoint(#[from] CheckpointError),
+    /// An array does not follow its format.
     #[error(transparent)]
     Format(#[from] crate::formats::FormatError),
     /// A file or a folder cannot be read or written.

@@ -179,10 +179,12 @@ fn same(
     }
     let held = sources[first].checkpoint.values(of)?;
     let (mut at, mut same) = (0, true);
-    sources[second].checkpoint.stream(index, &mut |values| {
-        same &= held[at..at + values.len()] == *values;
-        at += values.len();
-        Ok(())
-    })?;
+    sources[second]
+        .checkpoint
+        .stream::<ImportError>(index, &mut |values| {
+            same &= held[at..at + values.len()] == *values;
+            at += values.len();
+            Ok(())
+        })?;
     Ok(same)
 }

@@ -127,7 +127,7 @@ impl Rule {
             Self::NeverRuns => "left out: this model never runs it".to_owned(),
             Self::Zero => {
                 let mut zero = true;
-                checkpoint.stream(index, &mut |values| {
+                checkpoint.stream::<ImportError>(index, &mut |values| {
                     zero &= values.iter().all(|&v| v == 0.0);
                     Ok(())
                 })?;
@@ -276,7 +276,7 @@ fn distance(a: &[f32], b: &[f32]) -> f32 {
 fn equal(checkpoint: &mut Checkpoint, a: usize, b: usize) -> Result<bool, ImportError> {
     let first = checkpoint.values(a)?;
     let (mut at, mut same) = (0, true);
-    checkpoint.stream(b, &mut |values| {
+    checkpoint.stream::<ImportError>(b, &mut |values| {
         let part = &first[at..at + values.len()];
         same &= part
             .iter()

@@ -2,12 +2,12 @@
 //! inputs.
 
 use super::Checkpoint;
-use super::checkpoint::BARE;
 use super::rules::{Plan, Rule};
 use crate::engine::{Compute, Initialise, Parameters};
 use crate::evaluation::tmr::features::FEATURES;
 use crate::evaluation::tmr::stored::{DEVIATION, MEAN};
 use crate::evaluation::tmr::{MotionEncoder, MotionEncoderSettings};
+use crate::formats::checkpoint::BARE;
 use std::collections::BTreeMap;
 
 /// What a Lightning checkpoint puts in front of the names.

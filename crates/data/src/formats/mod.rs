@@ -1,11 +1,12 @@
 //! Container formats that carry arrays and pictures, read with bounded memory.
 //!
 //! Read in this order: [`zip`] (archives, also the shell of npz and of released checkpoints), [`npy`] (one array), [`npz`]
-//! (named arrays), [`pickle`] (an interpreter that can only describe data), [`png`] (pictures), [`place`] (where a file lies: on a disk,
+//! (named arrays), [`pickle`] (an interpreter that can only describe data), [`checkpoint`] (weights in any of their containers, streamed), [`png`] (pictures), [`place`] (where a file lies: on a disk,
 //! or in an object store), [`tar`] (shards). Every reader takes untrusted
 //! bytes: a malformed file is a [`FormatError`] that says where and why, a recording that cannot be read is a [`ReadError`], and
 //! no length field is believed before it has been compared with the size of the file.
 
+pub mod checkpoint;
 pub mod npy;
 pub mod npz;
 #[cfg(feature = "s3")]

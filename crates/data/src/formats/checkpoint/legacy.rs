@@ -1,10 +1,10 @@
 //! Torch files that are no archives, as torch wrote them before 1.6 and still does when asked to: five pickles (a magic number,
 //! the version, the machine, the objects, the keys of the storages), then every storage with its number of elements.
 
+use super::CheckpointError;
 use super::memory::identify;
 use super::{Checkpoint, Source, tree};
 use crate::formats::pickle::{Node, Pickle, Scalar};
-use crate::import::ImportError;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
@@ -18,15 +18,15 @@ const MAX_PICKLES: u64 = 32 << 20;
 const CUT: &str = "cut off";
 
 impl Checkpoint {
-    pub(super) fn legacy(path: &Path, file: File) -> Result<Self, ImportError> {
-        let refused = |reason: String| ImportError::refused(path, reason);
-        let length = file.metadata().map_err(ImportError::io(path))?.len();
+    pub(super) fn legacy(path: &Path, file: File) -> Result<Self, CheckpointError> {
+        let refused = |reason: String| CheckpointError::refused(path, reason);
+        let length = file.metadata().map_err(CheckpointError::io(path))?.len();
         let mut file = BufReader::new(file);
         let mut bytes = Vec::new();
         (&mut file)
             .take(MAX_PICKLES)
             .read_to_end(&mut bytes)
-            .map_err(ImportError::io(path))?;
+            .map_err(CheckpointError::io(path))?;
         let mut at = 0;
         let mut next = |what: &str| {
             let (pickle, used) = Pickle::parse_first(&bytes[at..]).map_err(|mut error| {
@@ -37,7 +37,7 @@ impl Checkpoint {
                 refused(error.to_string())
             })?;
             at += used;
-            Ok::<_, ImportError>(pickle)
+            Ok::<_, CheckpointError>(pickle)
         };
         let number = |pickle: &Pickle| match pickle.node(pickle.root()) {
             Node::Int(value) => Some(*value),
@@ -99,9 +99,10 @@ impl Checkpoint {
                 )));
             }
             file.seek(SeekFrom::Start(place))
-                .map_err(ImportError::io(path))?;
+                .map_err(CheckpointError::io(path))?;
             let mut count = [0; 8];
-            file.read_exact(&mut count).map_err(ImportError::io(path))?;
+            file.read_exact(&mut count)
+                .map_err(CheckpointError::io(path))?;
             if u64::from_le_bytes(count) != elements {
                 return Err(refused(format!(
                     "storage `{key}` has {} elements, the objects say {elements}",

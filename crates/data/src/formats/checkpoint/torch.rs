@@ -1,19 +1,19 @@
 //! Torch archives: a zip with one pickle that describes tensors, and one stored member per storage.
 
+use super::CheckpointError;
 use super::memory::identify;
 use super::{Checkpoint, Source, tree};
 use crate::formats::FormatError;
 use crate::formats::pickle::Pickle;
 use crate::formats::zip::{Method, ZipArchive};
-use crate::import::ImportError;
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
 use std::io::BufReader;
 use std::path::Path;
 
 impl Checkpoint {
-    pub(super) fn archive(path: &Path, file: File) -> Result<Self, ImportError> {
-        let refused = |reason: String| ImportError::refused(path, reason);
+    pub(super) fn archive(path: &Path, file: File) -> Result<Self, CheckpointError> {
+        let refused = |reason: String| CheckpointError::refused(path, reason);
         let in_file = |error: FormatError| error.in_file(path);
         let mut zip = ZipArchive::new(BufReader::new(file)).map_err(in_file)?;
         let roots: Vec<String> = zip

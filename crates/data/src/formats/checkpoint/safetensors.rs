@@ -1,9 +1,9 @@
 //! Safetensors: a JSON header with types, shapes and places, then the values.
 
+use super::CheckpointError;
 use super::memory::identify;
 use super::{Checkpoint, Format, Source};
 use crate::formats::pickle::{Scalar, Storage, TensorView};
-use crate::import::ImportError;
 use serde_json::{Map, Value};
 use std::collections::BTreeSet;
 use std::fs::File;
@@ -14,13 +14,13 @@ use std::path::Path;
 const MAX_HEADER: u64 = 8 << 20;
 
 impl Checkpoint {
-    pub(super) fn safetensors(path: &Path, file: File) -> Result<Self, ImportError> {
-        let refused = |reason: String| ImportError::refused(path, reason);
-        let length = file.metadata().map_err(ImportError::io(path))?.len();
+    pub(super) fn safetensors(path: &Path, file: File) -> Result<Self, CheckpointError> {
+        let refused = |reason: String| CheckpointError::refused(path, reason);
+        let length = file.metadata().map_err(CheckpointError::io(path))?.len();
         let mut file = BufReader::new(file);
         let mut prefix = [0; 8];
         file.read_exact(&mut prefix)
-            .map_err(ImportError::io(path))?;
+            .map_err(CheckpointError::io(path))?;
         let header = u64::from_le_bytes(prefix);
         if header > length.saturating_sub(8).min(MAX_HEADER) {
             return Err(refused(if header <= MAX_HEADER {
@@ -30,7 +30,8 @@ impl Checkpoint {
             }));
         }
         let mut text = vec![0; header as usize];
-        file.read_exact(&mut text).map_err(ImportError::io(path))?;
+        file.read_exact(&mut text)
+            .map_err(CheckpointError::io(path))?;
         let parsed: Map<String, Value> = serde_json::from_slice(&text)
             .map_err(|e| refused(format!("the header is not JSON: {e}")))?;
         let available = length - 8 - header;

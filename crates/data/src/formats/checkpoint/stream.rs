@@ -1,8 +1,8 @@
 //! Values of entries, in pieces.
 
+use super::CheckpointError;
 use super::{Checkpoint, Source};
 use crate::formats::pickle::{Scalar, TensorView};
-use crate::import::ImportError;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::Path;
 
@@ -11,18 +11,19 @@ const CHUNK: usize = 1 << 18;
 
 impl Checkpoint {
     /// Hands the values of an entry to `sink` in pieces, in C order, widened to f32 (64-bit numbers are rounded).
-    pub fn stream(
+    ///
+    /// # Errors
+    /// When the entry cannot be read as numbers, and what `sink` says.
+    pub fn stream<E: From<CheckpointError>>(
         &mut self,
         index: usize,
-        sink: &mut dyn FnMut(&[f32]) -> Result<(), ImportError>,
-    ) -> Result<(), ImportError> {
+        sink: &mut dyn FnMut(&[f32]) -> Result<(), E>,
+    ) -> Result<(), E> {
         let view = self.entries[index].view.clone();
         if let Some(what) = view.storage.scalar.unreadable() {
             let name = &self.entries[index].name;
-            return Err(ImportError::refused(
-                &self.path,
-                format!("`{name}` holds {what}"),
-            ));
+            let reason = format!("`{name}` holds {what}");
+            return Err(CheckpointError::refused(&self.path, reason).into());
         }
         let width = view.storage.scalar.width();
         let mut floats = vec![0f32; CHUNK];
@@ -41,19 +42,17 @@ impl Checkpoint {
                 sink(&floats[..count])?;
                 left -= count;
             }
-            return reader.finish();
+            return Ok(reader.finish()?);
         }
         // A strided view: read the piece of storage it spans, gather in C order.
         let span = view.end() - view.offset;
         if span > view.elements().saturating_mul(4).max(1 << 24) {
-            return Err(ImportError::refused(
-                &self.path,
-                format!(
-                    "`{}` picks {} of {span} elements of its storage: too sparse to be a weight",
-                    self.entries[index].name,
-                    view.elements()
-                ),
-            ));
+            let reason = format!(
+                "`{}` picks {} of {span} elements of its storage: too sparse to be a weight",
+                self.entries[index].name,
+                view.elements()
+            );
+            return Err(CheckpointError::refused(&self.path, reason).into());
         }
         let mut dense = vec![0u8; span as usize * width];
         let whole = TensorView {
@@ -84,9 +83,9 @@ impl Checkpoint {
     }
 
     /// All values of an entry at once (for small ones).
-    pub fn values(&mut self, index: usize) -> Result<Vec<f32>, ImportError> {
+    pub fn values(&mut self, index: usize) -> Result<Vec<f32>, CheckpointError> {
         let mut all = Vec::with_capacity(self.entries[index].view.elements() as usize);
-        self.stream(index, &mut |piece| {
+        self.stream::<CheckpointError>(index, &mut |piece| {
             all.extend_from_slice(piece);
             Ok(())
         })?;
@@ -94,13 +93,13 @@ impl Checkpoint {
     }
 
     /// A reader over a contiguous view. The member's checksum is verified on the way, or once beforehand.
-    fn reader(&mut self, view: &TensorView) -> Result<Bytes<'_>, ImportError> {
+    fn reader(&mut self, view: &TensorView) -> Result<Bytes<'_>, CheckpointError> {
         let width = view.storage.scalar.width() as u64;
         let path = self.path.as_path();
         match &mut self.source {
             Source::Flat { file, start } => {
                 file.seek(SeekFrom::Start(*start + view.offset * width))
-                    .map_err(ImportError::io(path))?;
+                    .map_err(CheckpointError::io(path))?;
                 Ok(Bytes {
                     path,
                     source: Box::new(file),
@@ -113,7 +112,7 @@ impl Checkpoint {
                     .copied()
                     .unwrap_or(u64::MAX / 2);
                 file.seek(SeekFrom::Start(start + view.offset * width))
-                    .map_err(ImportError::io(path))?;
+                    .map_err(CheckpointError::io(path))?;
                 Ok(Bytes {
                     path,
                     source: Box::new(file),
@@ -127,7 +126,7 @@ impl Checkpoint {
                 if !whole && self.verified.insert(member.clone()) {
                     let mut reader = zip.reader(&member).map_err(|e| e.in_file(path))?;
                     std::io::copy(&mut reader, &mut std::io::sink())
-                        .map_err(ImportError::io(path))?;
+                        .map_err(CheckpointError::io(path))?;
                 }
                 let mut reader = zip.reader(&member).map_err(|e| e.in_file(path))?;
                 if !whole {
@@ -154,17 +153,17 @@ struct Bytes<'a> {
 }
 
 impl Bytes<'_> {
-    fn fill(&mut self, buffer: &mut [u8]) -> Result<(), ImportError> {
+    fn fill(&mut self, buffer: &mut [u8]) -> Result<(), CheckpointError> {
         self.source
             .read_exact(buffer)
-            .map_err(ImportError::io(self.path))
+            .map_err(CheckpointError::io(self.path))
     }
 
-    fn finish(mut self) -> Result<(), ImportError> {
+    fn finish(mut self) -> Result<(), CheckpointError> {
         if self.to_end {
             self.source
                 .read(&mut [0])
-                .map_err(ImportError::io(self.path))?;
+                .map_err(CheckpointError::io(self.path))?;
         }
         Ok(())
     }

@@ -38,13 +38,13 @@ const COUNTERS: [&str; 3] = ["n_averaged", "num_updates", "decay"];
 
 impl Checkpoint {
     /// Whether a wrapper lies around layers, within names.
-    pub(in crate::import) fn has_wrapped_layers(&self) -> bool {
+    pub fn has_wrapped_layers(&self) -> bool {
         let wrapped = |name: &str| name.split('.').any(|part| ANYWHERE.contains(&part));
         self.entries.iter().any(|entry| wrapped(&entry.name))
     }
 
     /// Takes wrappers off the names of the tensors, as long as names stay apart; whether there were any.
-    pub(in crate::import) fn unwrap_names(&mut self) -> bool {
+    pub fn unwrap_names(&mut self) -> bool {
         let names: Vec<&str> = self.entries.iter().map(|e| e.name.as_str()).collect();
         let Some((short, taken)) = unwrapped(&names) else {
             return false;

@@ -13,7 +13,6 @@ mod torch;
 mod tree;
 mod wrappers;
 
-use super::ImportError;
 use crate::formats::pickle::{Scalar, TensorView};
 use crate::formats::zip::ZipArchive;
 use serde_json::{Map, Value};
@@ -21,6 +20,47 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
 use std::io::{BufReader, Read, Seek};
 use std::path::{Path, PathBuf};
+
+/// Why a checkpoint cannot be opened, or an entry of it read.
+#[derive(Debug, thiserror::Error)]
+pub enum CheckpointError {
+    /// The file is no checkpoint, or has an entry that cannot be read.
+    #[error("{}: {reason}", path.display())]
+    Refused {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong, in words.
+        reason: String,
+    },
+    /// The archive or the pickle does not follow its format.
+    #[error(transparent)]
+    Format(#[from] super::FormatError),
+    /// The file cannot be read.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// What the file system said.
+        #[source]
+        source: std::io::Error,
+    },
+}
+
+impl CheckpointError {
+    fn refused(path: &Path, reason: impl Into<String>) -> Self {
+        Self::Refused {
+            path: path.to_owned(),
+            reason: reason.into(),
+        }
+    }
+
+    fn io(path: &Path) -> impl FnOnce(std::io::Error) -> Self + '_ {
+        move |source| Self::Io {
+            path: path.to_owned(),
+            source,
+        }
+    }
+}
 
 /// The container a checkpoint lies in.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -110,19 +150,19 @@ enum Container {
 
 impl Checkpoint {
     /// Opens a checkpoint and checks its structure; no tensor is read.
-    pub fn open(path: &Path) -> Result<Self, ImportError> {
-        let refused = |reason: String| ImportError::refused(path, reason);
-        let facts = std::fs::metadata(path).map_err(ImportError::io(path))?;
+    pub fn open(path: &Path) -> Result<Self, CheckpointError> {
+        let refused = |reason: String| CheckpointError::refused(path, reason);
+        let facts = std::fs::metadata(path).map_err(CheckpointError::io(path))?;
         if !facts.is_file() {
             return Err(refused("no regular file".to_owned()));
         }
-        let mut file = File::open(path).map_err(ImportError::io(path))?;
+        let mut file = File::open(path).map_err(CheckpointError::io(path))?;
         let mut head = Vec::new();
         (&mut file)
             .take(sniff::HEAD as u64)
             .read_to_end(&mut head)
-            .map_err(ImportError::io(path))?;
-        file.rewind().map_err(ImportError::io(path))?;
+            .map_err(CheckpointError::io(path))?;
+        file.rewind().map_err(CheckpointError::io(path))?;
         match sniff::container(&head, facts.len()).map_err(refused)? {
             Container::Archive => Self::archive(path, file),
             Container::Legacy => Self::legacy(path, file),
