@@ -146,13 +146,7 @@ impl Normaliser {
     pub fn apply(&self, values: &mut [f32]) {
         for sample in values.chunks_mut(self.width()) {
             if self.root_relative {
-                let (root, others) = sample.split_at_mut(AXES.min(sample.len()));
-                for joint in others.chunks_mut(AXES) {
-                    joint
-                        .iter_mut()
-                        .zip(&*root)
-                        .for_each(|(x, root)| *x -= root);
-                }
+                shift_joints(sample, -1.0);
             }
             for ((value, mean), deviation) in sample.iter_mut().zip(&self.mean).zip(&self.deviation)
             {
@@ -169,14 +163,18 @@ impl Normaliser {
                 *value = *value * deviation + mean;
             }
             if self.root_relative {
-                let (root, others) = sample.split_at_mut(AXES.min(sample.len()));
-                for joint in others.chunks_mut(AXES) {
-                    joint
-                        .iter_mut()
-                        .zip(&*root)
-                        .for_each(|(x, root)| *x += root);
-                }
+                shift_joints(sample, 1.0);
             }
+        }
+    }
+}
+
+/// Adds `sign` times the first joint of a sample to its other joints.
+fn shift_joints(sample: &mut [f32], sign: f32) {
+    let (root, others) = sample.split_at_mut(AXES.min(sample.len()));
+    for joint in others.chunks_mut(AXES) {
+        for (value, root) in joint.iter_mut().zip(&*root) {
+            *value += sign * root;
         }
     }
 }
@@ -185,12 +183,14 @@ impl Normaliser {
 /// seen from its first joint, where that is valid, too.
 fn each_valid(signal: &Signal, root: Option<usize>, mut visit: impl FnMut(usize, f64)) {
     let channels = signal.values.shape().last().copied().unwrap_or(1).max(1);
-    let valid: Option<Vec<bool>> = signal
+    let values = signal.values.as_standard_layout();
+    let values = values.as_slice().unwrap_or_default();
+    let valid = signal
         .valid
         .as_ref()
-        .map(|valid| valid.iter().copied().collect());
-    let is_valid = |i: usize| valid.as_ref().is_none_or(|valid| valid[i / channels]);
-    let values: Vec<f32> = signal.values.iter().copied().collect();
+        .map(|valid| valid.as_standard_layout());
+    let valid = valid.as_ref().and_then(|valid| valid.as_slice());
+    let is_valid = |i: usize| valid.is_none_or(|valid| valid[i / channels]);
     for (i, value) in values.iter().enumerate().filter(|(i, _)| is_valid(*i)) {
         let first = root.map(|width| i / width * width + i % AXES);
         match first.filter(|first| i - first >= AXES) {

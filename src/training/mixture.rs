@@ -1,6 +1,6 @@
 //! The data sets that a tokenizer learns from, and how often each is drawn.
 
-use super::tokenizer::Epochs;
+use super::epochs::Epochs;
 use super::trainer::TrainingError;
 use std::ops::Range;
 

@@ -3,12 +3,13 @@
 //! Read in this order: [`settings`], [`source`] (where tokens come from), [`sampler`] (which clip stands where), [`loader`]
 //! (batches prepared ahead), [`trainer`] (**one step, and the state between steps**), [`trainer::ranks`] (a step on several
 //! processes), [`trainer::checkpoint`], [`mod@fit`] (the loop), [`validation`], [`optimizer`], [`schedule`]. Trained are [`mget`] and [`tokenizer`]s;
-//! [`kmeans`] is what the latter have to beat. [`mget_fit`] and [`tokenizer_fit`] are the way from clips to a model; a [`mixture`]
-//! is what a tokenizer learns from.
+//! [`kmeans`] is what the latter have to beat. [`mget_fit`] and [`tokenizer_fit`] are the way from clips to a model; a
+//! tokenizer learns from a [`mixture`], in [`epochs`].
 //!
 //! Data order, masks and initial weights are functions of the seed and the step, so a run that was killed and resumed has the
 //! same bytes as one that was not.
 
+pub mod epochs;
 pub mod fit;
 pub mod kmeans;
 pub mod loader;

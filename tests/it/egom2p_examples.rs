@@ -12,7 +12,8 @@ use reviv::tokenizer::Tokenizer;
 use reviv::tokenizer::normaliser::Normaliser;
 use reviv::tokenizer::trained::{VqTokenizer, prepare};
 use reviv::tokenizer::vq::{VqSettings, VqVae};
-use reviv::training::tokenizer::{Epochs, TokenizerTraining};
+use reviv::training::epochs::Epochs;
+use reviv::training::tokenizer::TokenizerTraining;
 use reviv::training::{Trainer, TrainingError};
 
 const SAMPLES: usize = 60;

@@ -97,6 +97,18 @@ fn together(
     first
 }
 
+/// The checkpoints after five steps have the same bytes.
+fn assert_same_checkpoint(found: &Path, expected: &Path, size: usize) {
+    for file in [
+        "weights.safetensors",
+        "optimizer.safetensors",
+        "progress.json",
+    ] {
+        let read = |run: &Path| std::fs::read(run.join("5").join(file)).unwrap();
+        assert!(read(found) == read(expected), "{size} ranks: {file}");
+    }
+}
+
 #[test]
 fn in_the_order_of_samples_any_number_of_ranks_trains_to_the_same_bytes() {
     let settings = settings(Reduction::Ordered, 1);
@@ -110,14 +122,7 @@ fn in_the_order_of_samples_any_number_of_ranks_trains_to_the_same_bytes() {
             expected,
             "{size} ranks"
         );
-        for file in [
-            "weights.safetensors",
-            "optimizer.safetensors",
-            "progress.json",
-        ] {
-            let read = |run: &Path| std::fs::read(run.join("5").join(file)).unwrap();
-            assert!(read(&own) == read(&alone), "{size} ranks: {file}");
-        }
+        assert_same_checkpoint(&own, &alone, size);
         // What was begun by one number of ranks goes on with another.
         let resumed = together(5 - size, &settings, &own, Some(&own.join("5")));
         assert_eq!(
@@ -169,14 +174,7 @@ fn ranks_that_share_the_optimizer_s_state_train_to_the_same_bytes_and_checkpoint
                 expected,
                 "{size} ranks"
             );
-            for file in [
-                "weights.safetensors",
-                "optimizer.safetensors",
-                "progress.json",
-            ] {
-                let read = |run: &Path| std::fs::read(run.join("5").join(file)).unwrap();
-                assert!(read(&own) == read(&other), "{size} ranks: {file}");
-            }
+            assert_same_checkpoint(&own, &other, size);
             if reduction == Reduction::Ordered {
                 let checkpoint = own.join("5");
                 let resumed = together(6 - size, &sharded, &own, Some(&checkpoint));
