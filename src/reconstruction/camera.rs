@@ -13,8 +13,9 @@ pub struct CameraSettings {
     /// Horizontal field of view of the centre square in degrees, where there is no `calibration`.
     #[schemars(range(min = 1.0, max = 170.0))]
     pub field_of_view: f64,
-    /// Pinhole calibration of the whole upright picture; crop and resize are followed.
-    pub calibration: Option<Calibration>,
+    /// Pinhole calibration of the whole upright picture; crop and resize are followed, and a picture of another size but the same
+    /// shape is scaled.
+    pub calibration: Option<Intrinsics>,
     /// Direction against gravity in the axes of the first camera: x right, y down, z forward; absent: that camera is level.
     pub up: Option<[f64; 3]>,
 }
@@ -27,24 +28,6 @@ impl Default for CameraSettings {
             up: None,
         }
     }
-}
-
-/// Pinhole intrinsics in pixels of the upright picture; the centre of the top-left pixel is (0, 0).
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
-#[serde(deny_unknown_fields)]
-pub struct Calibration {
-    /// Focal lengths.
-    pub fx: f64,
-    /// Vertical focal length.
-    pub fy: f64,
-    /// Principal point.
-    pub cx: f64,
-    /// Row of the principal point.
-    pub cy: f64,
-    /// Size of the picture these numbers are for; another size with the same shape is scaled.
-    pub width: u32,
-    /// Height of that picture.
-    pub height: u32,
 }
 
 /// Why a camera cannot be used.
@@ -167,7 +150,7 @@ mod tests {
     #[test]
     fn a_calibration_follows_crop_and_resize() {
         let settings = CameraSettings {
-            calibration: Some(Calibration {
+            calibration: Some(Intrinsics {
                 fx: 600.0,
                 fy: 610.0,
                 cx: 959.5,

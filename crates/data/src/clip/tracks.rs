@@ -73,7 +73,10 @@ pub struct CameraTrack {
 }
 
 /// Pinhole intrinsics in pixels; the centre of the top-left pixel is (0, 0).
-#[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
+#[derive(
+    Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize, schemars::JsonSchema,
+)]
+#[serde(deny_unknown_fields)]
 pub struct Intrinsics {
     /// Focal length along x, pixels.
     pub fx: f64,
@@ -83,9 +86,9 @@ pub struct Intrinsics {
     pub cx: f64,
     /// Row of the principal point, pixels.
     pub cy: f64,
-    /// Of the frames, pixels.
+    /// Width of the pictures that these numbers are for, pixels.
     pub width: u32,
-    /// Of the frames, pixels.
+    /// Height of the pictures that these numbers are for, pixels.
     pub height: u32,
 }
 
