@@ -4,7 +4,7 @@
 //! (it lives in the gravity frame of the window's first camera, so only heading and position change); hands stay in the camera
 //! of their sample, gaze in its image. A value that is unknown on one side of a boundary is taken from the other.
 
-use super::export::bvh::{from_camera, from_z_up, write_bvh};
+use super::export::bvh::{from_camera, from_z_up, is_whole, write_bvh};
 use super::export::camera::{write_colmap, write_tum};
 use super::export::files::Files;
 use super::export::write_gaze;
@@ -266,9 +266,8 @@ impl Track for JointPath {
             poses[t][j].iter().all(|v| v.is_finite())
         });
         files.array_with_validity(part.file, name, values, valid, "m", frame, learned());
-        // A hand that is never seen whole has no motion to write.
-        let whole = |pose: &Joints| pose.iter().flatten().all(|v| v.is_finite());
-        if part.in_camera && !poses.iter().any(whole) {
+        // A skeleton that is never seen whole has no motion to write.
+        if !poses.iter().any(is_whole) {
             return Ok(());
         }
         files.file(&format!("{name}.bvh"), |out| {

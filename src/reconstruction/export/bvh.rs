@@ -8,7 +8,8 @@ use crate::geometry::skeleton::{JOINTS, Joints, Skeleton};
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion, Vector3};
 use std::io::Write;
 
-/// Writes the frames whose joints are all known; a frame with an unknown joint repeats the one before it.
+/// Writes every frame, so that the motion stays in time with the video: one with an unknown joint repeats the last that is whole, or,
+/// before there is any, the first.
 ///
 /// `up` turns the source's axes into x right, y up, z back: [`from_z_up`] for the world, [`from_camera`] for camera space.
 ///
@@ -21,7 +22,7 @@ pub fn write_bvh(
     up: &UnitQuaternion<f64>,
     out: &mut impl Write,
 ) -> std::io::Result<()> {
-    let poses: Vec<Vec<Vector3<f64>>> = known(frames, up);
+    let poses: Vec<Vec<Vector3<f64>>> = whole_poses(frames, up);
     let Some(first) = poses.first() else {
         return Err(std::io::Error::new(
             std::io::ErrorKind::InvalidData,
@@ -68,21 +69,29 @@ pub fn from_camera() -> UnitQuaternion<f64> {
     UnitQuaternion::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI)
 }
 
-pub(super) fn known(frames: &[Joints], up: &UnitQuaternion<f64>) -> Vec<Vec<Vector3<f64>>> {
-    let mut poses: Vec<Vec<Vector3<f64>>> = Vec::with_capacity(frames.len());
-    for frame in frames {
-        if frame.iter().flatten().all(|v| v.is_finite()) {
-            poses.push(
-                frame
-                    .iter()
-                    .map(|p| up * Vector3::from(p.map(f64::from)))
-                    .collect(),
-            );
-        } else if let Some(last) = poses.last() {
-            poses.push(last.clone());
-        }
-    }
-    poses
+/// One pose per frame: its own where the frame is whole, else the last whole one, or the first. None where no frame is whole.
+pub(super) fn whole_poses(frames: &[Joints], up: &UnitQuaternion<f64>) -> Vec<Vec<Vector3<f64>>> {
+    let Some(mut last) = frames.iter().find(|frame| is_whole(frame)) else {
+        return Vec::new();
+    };
+    let pose = |joints: &Joints| -> Vec<_> {
+        let turned = joints.iter().map(|p| up * Vector3::from(p.map(f64::from)));
+        turned.collect()
+    };
+    frames
+        .iter()
+        .map(|frame| {
+            if is_whole(frame) {
+                last = frame;
+            }
+            pose(last)
+        })
+        .collect()
+}
+
+/// Whether all joints are known.
+pub(crate) fn is_whole(joints: &Joints) -> bool {
+    joints.iter().flatten().all(|value| value.is_finite())
 }
 
 pub(super) fn children(skeleton: &Skeleton, joint: usize) -> impl Iterator<Item = usize> + '_ {
@@ -311,6 +320,16 @@ mod tests {
             }
         }
         assert!(worst < 2e-3, "{worst} m");
+    }
+
+    #[test]
+    fn every_frame_has_a_pose_from_the_nearest_whole_one_before_it_or_the_first() {
+        let at = |x: f32| [[x, 0.0, 0.0]; JOINTS];
+        let mut part = at(9.0);
+        part[3][1] = f32::NAN;
+        let poses = whole_poses(&[part, at(1.0), part, at(2.0)], &UnitQuaternion::identity());
+        let found: Vec<f64> = poses.iter().map(|pose| pose[0].x).collect();
+        assert_eq!(found, [1.0, 1.0, 1.0, 2.0]);
     }
 
     #[test]

@@ -4,7 +4,7 @@
 //! reconstructed; bones are small octahedra. Metres, y up, x right, as glTF has it; a frame with an unknown joint repeats the one
 //! before it.
 
-use super::bvh::{children, from_camera, from_z_up, known, rest_offsets, rotations};
+use super::bvh::{children, from_camera, from_z_up, rest_offsets, rotations, whole_poses};
 use crate::clip::Intrinsics;
 use crate::geometry::rigid::Rigid;
 use crate::geometry::skeleton::{JOINTS, Joints, Skeleton};
@@ -138,7 +138,7 @@ impl Glb {
 
     fn wearer(&mut self, wearer: &Wearer<'_>) {
         let skeleton = wearer.skeleton;
-        let poses = known(wearer.poses, &from_z_up());
+        let poses = whole_poses(wearer.poses, &from_z_up());
         let Some(first) = poses.first() else {
             return;
         };
