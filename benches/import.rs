@@ -165,8 +165,8 @@ fn decode(folder: &Path) {
     };
     let start = Instant::now();
     let made = model.predict(&[clip], &[0], &wish).unwrap();
-    for (name, confidence) in &made[0].confidence {
-        println!("{name}: {} samples", confidence.len());
+    for (name, certainty) in &made[0].certainty {
+        println!("{name}: {} samples", certainty.len());
     }
     assert!(made[0].clip.body().is_some() && made[0].clip.camera().is_some());
     println!("decoded a clip in {:.1} s", start.elapsed().as_secs_f64());

@@ -389,8 +389,8 @@ mod tests {
         let settings = settings(Order::Independent, Scheme::Maskgit);
         let generated = generate(&toy(), &settings, &[partly], &["camera"], 0).unwrap();
         let tokens = &generated[0].targets["camera"];
-        assert_eq!((tokens.ids[4], tokens.confidence[4]), (19, 1.0));
-        assert!(tokens.confidence.iter().all(|c| (0.0..=1.0).contains(c)));
+        assert_eq!((tokens.ids[4], tokens.certainty[4]), (19, 1.0));
+        assert!(tokens.certainty.iter().all(|c| (0.0..=1.0).contains(c)));
         let empty = Sample {
             id: 0,
             slots: vec![Slot::masked(8), Slot::masked(12), Slot::masked(21)],

@@ -1,4 +1,4 @@
-//! What generating gives: tokens with a confidence, and on demand a trace of every step.
+//! What generating gives: tokens with a certainty, and on demand a trace of every step.
 
 use super::filter::Pick;
 use std::collections::BTreeMap;
@@ -16,7 +16,7 @@ pub struct GeneratedTokens {
     /// One per position; tokens of inputs stand unchanged.
     pub ids: Vec<u32>,
     /// 0 (the model knew nothing) to 1 (it was certain), from the entropy when the token was decided; 1 for inputs.
-    pub confidence: Vec<f32>,
+    pub certainty: Vec<f32>,
 }
 
 /// What a step saw and did, for checks against a reference.

@@ -15,7 +15,7 @@ use std::rc::Rc;
 struct State<'a> {
     samples: Vec<Sample<'a>>,
     /// By (sample, modality).
-    confidence: BTreeMap<(usize, usize), Vec<f32>>,
+    certainty: BTreeMap<(usize, usize), Vec<f32>>,
     /// Nothing was decided yet: the encoder reads the inputs alone.
     untouched: bool,
 }
@@ -60,7 +60,7 @@ impl<'m, M: TokenModel> Samples<'m, M> {
             // Every chain starts from the inputs; what it decides is known to the rest of the chain only.
             let mut state = State {
                 samples: samples.to_vec(),
-                confidence: BTreeMap::new(),
+                certainty: BTreeMap::new(),
                 untouched: true,
             };
             for group in &chain.groups {
@@ -76,13 +76,13 @@ impl<'m, M: TokenModel> Samples<'m, M> {
                     let Slot::Tokens { ids, .. } = &sample.slots[target.modality] else {
                         continue;
                     };
-                    let confidence = state
-                        .confidence
+                    let certainty = state
+                        .certainty
                         .remove(&(position, target.modality))
                         .unwrap_or_else(|| vec![1.0; ids.len()]);
                     let tokens = GeneratedTokens {
                         ids: ids.clone(),
-                        confidence,
+                        certainty,
                     };
                     generated.targets.insert(name.clone(), tokens);
                 }
@@ -326,8 +326,8 @@ impl<'m, M: TokenModel> Samples<'m, M> {
             let Slot::Tokens { ids, known } = &mut sample.slots[m] else {
                 continue;
             };
-            let confidence = state
-                .confidence
+            let certainty = state
+                .certainty
                 .entry((position, m))
                 .or_insert_with(|| vec![1.0; ids.len()]);
             let mut selected: Vec<u32> = Vec::with_capacity(chosen.len());
@@ -335,7 +335,7 @@ impl<'m, M: TokenModel> Samples<'m, M> {
                 let place = target_positions[m][row] as usize;
                 ids[place] = own[row].token;
                 known[place] = true;
-                confidence[place] = own[row].certainty;
+                certainty[place] = own[row].certainty;
                 selected.push(place as u32);
             }
             selected.sort_unstable();

@@ -11,25 +11,25 @@ pub(super) fn seed_of_round(seed: u64, round: usize) -> u64 {
     }
 }
 
-/// The mean over rounds of every clip's signal and confidence.
+/// The mean over rounds of every clip's signal and certainty.
 #[derive(Default)]
 pub(super) struct Mean {
     rounds: usize,
     signals: Vec<Signal>,
-    confidence: Vec<Vec<f32>>,
+    certainty: Vec<Vec<f32>>,
 }
 
 impl Mean {
-    pub fn add(&mut self, signals: Vec<Signal>, confidence: Vec<Vec<f32>>) {
+    pub fn add(&mut self, signals: Vec<Signal>, certainty: Vec<Vec<f32>>) {
         self.rounds += 1;
         if self.rounds == 1 {
-            (self.signals, self.confidence) = (signals, confidence);
+            (self.signals, self.certainty) = (signals, certainty);
             return;
         }
         for (sum, signal) in self.signals.iter_mut().zip(signals) {
             sum.values += &signal.values;
         }
-        for (sum, values) in self.confidence.iter_mut().zip(confidence) {
+        for (sum, values) in self.certainty.iter_mut().zip(certainty) {
             for (sum, value) in sum.iter_mut().zip(values) {
                 *sum += value;
             }
@@ -41,14 +41,14 @@ impl Mean {
         for signal in &mut self.signals {
             signal.values /= rounds;
         }
-        for value in self.confidence.iter_mut().flatten() {
+        for value in self.certainty.iter_mut().flatten() {
             *value /= rounds;
         }
-        (self.signals, self.confidence)
+        (self.signals, self.certainty)
     }
 }
 
-/// The mean confidence of the tokens of each of `steps` time steps, spread over `samples`.
+/// The mean certainty of the tokens of each of `steps` time steps, spread over `samples`.
 pub(super) fn per_sample(tokens: &[f32], steps: usize, samples: usize) -> Vec<f32> {
     let each = (tokens.len() / steps.max(1)).max(1);
     let means: Vec<f32> = tokens
@@ -66,7 +66,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn confidence_of_tokens_is_spread_over_samples() {
+    fn certainty_of_tokens_is_spread_over_samples() {
         let tokens = [1.0, 0.0, 0.5, 0.5];
         assert_eq!(per_sample(&tokens, 2, 6), [0.5, 0.5, 0.5, 0.5, 0.5, 0.5]);
         assert_eq!(per_sample(&[0.25, 0.75], 2, 4), [0.25, 0.25, 0.75, 0.75]);
@@ -83,8 +83,8 @@ mod tests {
         let mut mean = Mean::default();
         mean.add(vec![signal(1.0)], vec![vec![0.5]]);
         mean.add(vec![signal(2.0)], vec![vec![1.0]]);
-        let (signals, confidence) = mean.finish();
+        let (signals, certainty) = mean.finish();
         assert_eq!(signals[0].values, signal(1.5).values);
-        assert_eq!(confidence, [[0.75]]);
+        assert_eq!(certainty, [[0.75]]);
     }
 }

@@ -79,7 +79,7 @@ pub struct Reconstructed {
     /// Holds the wanted modalities and nothing else.
     pub clip: Clip,
     /// Per modality and sample, 0 (a guess) to 1 (certain), from the entropies of the tokens. Not an accuracy.
-    pub confidence: BTreeMap<String, Vec<f32>>,
+    pub certainty: BTreeMap<String, Vec<f32>>,
 }
 
 impl Model {
@@ -369,7 +369,7 @@ impl Model {
             .iter()
             .map(|clip| Reconstructed {
                 clip: Clip::empty(clip.id.clone(), clip.source.clone()),
-                confidence: BTreeMap::new(),
+                certainty: BTreeMap::new(),
             })
             .collect();
         for name in request.targets {
@@ -388,14 +388,14 @@ impl Model {
                         grid: tokenizer.grid().to_vec(),
                     })
                     .collect();
-                let confidence = own.iter().map(|tokens| tokens.confidence.clone()).collect();
-                mean.add(tokenizer.decode(&grids)?, confidence);
+                let certainty = own.iter().map(|tokens| tokens.certainty.clone()).collect();
+                mean.add(tokenizer.decode(&grids)?, certainty);
             }
-            let (signals, confidence) = mean.finish();
-            for ((one, signal), tokens) in made.iter_mut().zip(signals).zip(confidence) {
+            let (signals, certainty) = mean.finish();
+            for ((one, signal), tokens) in made.iter_mut().zip(signals).zip(certainty) {
                 let steps = tokenizer.grid()[0];
                 let each = per_sample(&tokens, steps, signal.values.shape()[0]);
-                one.confidence.insert(name.clone(), each);
+                one.certainty.insert(name.clone(), each);
                 modality
                     .insert(signal, &mut one.clip)
                     .map_err(|error| wrong_clip(&one.clip, error))?;

@@ -1,6 +1,6 @@
 //! `op: predict`: a model generates the modalities that are not its inputs, for every clip of a split (Supp. C).
 //!
-//! Writes a folder of [`crate::reconstruction::predictions`]: decoded signals with a confidence per sample, and beside it the
+//! Writes a folder of [`crate::reconstruction::predictions`]: decoded signals with a certainty per sample, and beside it the
 //! reconstruction bound: the clips' own signals after a round trip through the model's tokenizers. Several ranks predict a batch each at a
 //! time.
 
@@ -33,7 +33,7 @@ use std::path::Path;
 const BATCH: usize = 8;
 
 /// By modality, one value per sample.
-type Confidence = BTreeMap<String, Vec<f32>>;
+type Certainty = BTreeMap<String, Vec<f32>>;
 
 /// Settings of [`Predict`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
@@ -118,7 +118,7 @@ impl Op for Predict {
     }
 
     fn version(&self) -> u32 {
-        5
+        6
     }
 
     fn together(&self) -> bool {
@@ -314,26 +314,26 @@ impl Op for Predict {
                 })
                 .map_err(refused)?;
             let mut entries = vec![Vec::new(); writers.len()];
-            let mut write = |writer: usize, at: usize, clip: &Clip, confidence: &Confidence| {
-                let entry = writers[writer].write(range.start + at, clip, confidence);
+            let mut write = |writer: usize, at: usize, clip: &Clip, certainty: &Certainty| {
+                let entry = writers[writer].write(range.start + at, clip, certainty);
                 entries[writer].push(entry.map_err(StageError::other)?);
                 Ok::<_, StageError>(())
             };
             for (at, one) in decoded.iter().enumerate() {
-                write(0, at, &one.clip, &one.confidence)?;
+                write(0, at, &one.clip, &one.certainty)?;
             }
             let others = model
                 .decode_samples(&batch, &tokens, &request, samples)
                 .map_err(refused)?;
             for (n, decoded) in others.iter().enumerate() {
                 for (at, one) in decoded.iter().enumerate() {
-                    write(first_sample + n, at, &one.clip, &one.confidence)?;
+                    write(first_sample + n, at, &one.clip, &one.certainty)?;
                 }
             }
             if settings.reconstruction_bound {
                 let back = model.round_trip(&batch, &targets).map_err(refused)?;
                 for (at, clip) in back.iter().enumerate() {
-                    write(1, at, clip, &Confidence::new())?;
+                    write(1, at, clip, &Certainty::new())?;
                 }
             }
             made.push(entries);

@@ -111,7 +111,7 @@ impl Op for Reconstruct {
     }
 
     fn version(&self) -> u32 {
-        7
+        8
     }
 
     fn about(&self) -> &'static str {

@@ -12,7 +12,7 @@
 //! | `rgb` | `[T, H, W, 3]` u8 | colour |
 //! | `declared.<name>` | `[T, C]` | a modality declared in YAML |
 //! | `<modality>_valid` | the signal without its last axis | false = nothing predicted there |
-//! | `confidence.<modality>` | `[T]` | from the token entropies, 0 to 1 |
+//! | `certainty.<modality>` | `[T]` | from the token entropies, 0 to 1 |
 //!
 //! Other systems need no `predictions.json`: a folder of npz files is enough, the path of a file without `.npz` is its clip id,
 //! and rates are the usual ones (video 8 Hz, everything else 30 Hz). [`arrays`] is one clip as arrays and back.
@@ -172,17 +172,17 @@ impl PredictionsWriter {
         })
     }
 
-    /// Writes one clip's predicted signals; `confidence` by modality name, one value per sample.
+    /// Writes one clip's predicted signals; `certainty` by modality name, one value per sample.
     ///
     /// # Errors
     /// When the file cannot be written.
     pub fn add(
         &mut self,
         clip: &Clip,
-        confidence: &BTreeMap<String, Vec<f32>>,
+        certainty: &BTreeMap<String, Vec<f32>>,
     ) -> Result<(), PredictionsError> {
         let next = self.index.clips.len();
-        let entry = self.write(next, clip, confidence)?;
+        let entry = self.write(next, clip, certainty)?;
         self.index.clips.push(entry);
         Ok(())
     }
@@ -196,13 +196,13 @@ impl PredictionsWriter {
         &self,
         number: usize,
         clip: &Clip,
-        confidence: &BTreeMap<String, Vec<f32>>,
+        certainty: &BTreeMap<String, Vec<f32>>,
     ) -> Result<PredictedClip, PredictionsError> {
         let file = format!("clips/{number:06}.npz");
         let mut npz = to_npz(clip);
-        for (modality, values) in confidence {
+        for (modality, values) in certainty {
             npz = npz.with(
-                &format!("confidence.{modality}"),
+                &format!("certainty.{modality}"),
                 Array1::from(values.clone()),
             );
         }
@@ -336,11 +336,11 @@ impl Predictions {
             .map_err(|reason| PredictionsError::content(&path, reason))
     }
 
-    /// Confidences of the clip at `position`, by modality.
+    /// Token certainty of the clip at `position`, by modality.
     ///
     /// # Errors
     /// As [`Predictions::load`].
-    pub fn confidence(
+    pub fn certainty(
         &self,
         position: usize,
     ) -> Result<BTreeMap<String, Vec<f32>>, PredictionsError> {
@@ -350,7 +350,7 @@ impl Predictions {
         let npz = Npz::read(&self.directory.join(&entry.file))?;
         npz.arrays
             .iter()
-            .filter_map(|(name, array)| Some((name.strip_prefix("confidence.")?, array)))
+            .filter_map(|(name, array)| Some((name.strip_prefix("certainty.")?, array)))
             .map(|(modality, array)| {
                 Ok((modality.to_owned(), array.to_dim::<f32, Ix1>()?.to_vec()))
             })
@@ -459,8 +459,8 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let mut writer =
             PredictionsWriter::create(folder.path(), "reviv", BTreeMap::new()).unwrap();
-        let confidence = BTreeMap::from([("gaze".to_owned(), vec![0.5_f32; 4])]);
-        writer.add(&clip(), &confidence).unwrap();
+        let certainty = BTreeMap::from([("gaze".to_owned(), vec![0.5_f32; 4])]);
+        writer.add(&clip(), &certainty).unwrap();
         writer.finish().unwrap();
         let predictions = Predictions::open(folder.path()).unwrap();
         let back = predictions.load(0).unwrap();
@@ -476,7 +476,7 @@ mod tests {
             ("world/a/000001", own.gaze(), own.body())
         );
         assert_eq!(back.signal("head_imu"), own.signal("head_imu"));
-        assert_eq!(predictions.confidence(0).unwrap(), confidence);
+        assert_eq!(predictions.certainty(0).unwrap(), certainty);
     }
 
     #[test]

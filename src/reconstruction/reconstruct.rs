@@ -268,7 +268,7 @@ pub fn reconstruct_recording(
         };
         done(Part::Decode)?;
         for one in made {
-            builder.push(window, rgb.frames.view(), &one.clip, &one.confidence)?;
+            builder.push(window, rgb.frames.view(), &one.clip, &one.certainty)?;
         }
         builder.push_samples(window, samples.iter().flatten().map(|one| &one.clip));
         done(Part::Stitch)?;

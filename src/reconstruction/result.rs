@@ -59,7 +59,7 @@ pub struct Reconstruction {
     pub(super) samples: Vec<Tracks>,
     pub(super) boundaries: Vec<WindowBoundary>,
     pub(super) depth: Depth,
-    pub(super) confidence: BTreeMap<String, Vec<f32>>,
+    pub(super) certainty: BTreeMap<String, Vec<f32>>,
     pub(super) video: VideoFrames,
     /// Depth on the grid of the page.
     pub(super) grids: Vec<Array2<f32>>,
@@ -172,8 +172,8 @@ impl Reconstruction {
 
     /// By modality, 0 (a guess) to 1 (certain) at 30 Hz, from the entropies of the tokens. Not an accuracy.
     #[must_use]
-    pub fn confidence(&self) -> &BTreeMap<String, Vec<f32>> {
-        &self.confidence
+    pub fn certainty(&self) -> &BTreeMap<String, Vec<f32>> {
+        &self.certainty
     }
 
     /// How well neighbouring windows agree.

@@ -19,5 +19,5 @@ pub mod scene;
 
 pub use page::write_page;
 pub use scene::{
-    Badge, Confidence, DepthGrids, Drawing, Fact, Part, Scene, Track, VideoFrames, ViewError,
+    Badge, Certainty, DepthGrids, Drawing, Fact, Part, Scene, Track, VideoFrames, ViewError,
 };

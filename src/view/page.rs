@@ -45,7 +45,7 @@ pub fn write_page(scene: &Scene, out: &mut impl Write) -> Result<(), ViewError> 
         "tracks": scene.tracks.iter().map(|t| json!({"name": t.name, "truth": t.truth,
             "ghost": t.name.starts_with(SAMPLE),
             "parts": t.parts.iter().map(part).collect::<Vec<Value>>()})).collect::<Vec<Value>>(),
-        "confidence": scene.confidence.iter().map(|c| json!({"name": c.name})).collect::<Vec<Value>>(),
+        "certainty": scene.certainty.iter().map(|c| json!({"name": c.name})).collect::<Vec<Value>>(),
     });
 
     let mut rest = TEMPLATE;
@@ -82,10 +82,10 @@ pub fn write_page(scene: &Scene, out: &mut impl Write) -> Result<(), ViewError> 
                     let name = format!("{}-{}", track.name, part.modality);
                     blob(out, &name, &float_bytes(part.values.iter().copied()))?;
                 }
-                for strip in &scene.confidence {
+                for strip in &scene.certainty {
                     blob(
                         out,
-                        &format!("confidence-{}", strip.name),
+                        &format!("certainty-{}", strip.name),
                         &float_bytes(strip.values.iter().copied()),
                     )?;
                 }

@@ -30,7 +30,7 @@ pub struct Scene {
     /// The prediction first; the truth, where it is known, beside it.
     pub tracks: Vec<Track>,
     /// One per modality for which it is known.
-    pub confidence: Vec<Confidence>,
+    pub certainty: Vec<Certainty>,
 }
 
 /// How a badge is meant; the words say it too.
@@ -203,7 +203,7 @@ pub enum Drawing {
 
 /// A strip under the timeline: 1 is certain, 0 is a guess.
 #[derive(Debug, Clone)]
-pub struct Confidence {
+pub struct Certainty {
     /// The modality.
     pub name: String,
     /// In `[0, 1]`, evenly spread over the timeline; NaN where unknown.

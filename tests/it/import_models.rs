@@ -392,7 +392,7 @@ fn an_imported_set_decodes_a_clip_end_to_end() {
         let clip = &one.clip;
         assert!(clip.camera().is_some() && clip.depth().is_some() && clip.gaze().is_some());
         assert!(clip.body().is_some() && clip.left_hand().is_some() && clip.right_hand().is_some());
-        assert_eq!(one.confidence["camera"].len(), 60);
+        assert_eq!(one.certainty["camera"].len(), 60);
     }
 
     // Another tokenizer in its place is noticed.

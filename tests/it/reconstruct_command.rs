@@ -216,7 +216,7 @@ fn a_video_becomes_a_complete_folder_and_the_same_bytes_again() {
         "points.ply",
         "scene.glb",
         "gaze.npz",
-        "confidence.npz",
+        "certainty.npz",
         "view.html",
         "manifest.json",
     ] {

@@ -153,13 +153,13 @@ fn build(
         });
         // Every window has a scale of its own, as relative depth has.
         let wrong = [2.0 + window.index as f64, 0.1 * window.index as f64];
-        let confidence = BTreeMap::from([("body".to_owned(), vec![0.5; 60])]);
+        let certainty = BTreeMap::from([("body".to_owned(), vec![0.5; 60])]);
         builder
             .push(
                 &window,
                 rgb.view(),
                 &decoded(window.start, wrong),
-                &confidence,
+                &certainty,
             )
             .unwrap();
     }
@@ -224,7 +224,7 @@ fn a_walk_becomes_metric_and_every_file_is_there() {
             .iter()
             .all(|s| s.camera_m.unwrap() < 1e-6 && s.body_m.unwrap() < 1e-4)
     );
-    assert!((manifest.confidence["body"] - 0.5).abs() < 1e-6);
+    assert!((manifest.certainty["body"] - 0.5).abs() < 1e-6);
 }
 
 #[test]

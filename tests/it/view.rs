@@ -8,7 +8,7 @@ use reviv::geometry::skeleton::{BODY, HAND, JOINTS, Skeleton};
 use reviv::reconstruction::cloud::lift;
 use reviv::view::scene::Tone;
 use reviv::view::{
-    Badge, Confidence, DepthGrids, Drawing, Fact, Part, Scene, Track, VideoFrames, write_page,
+    Badge, Certainty, DepthGrids, Drawing, Fact, Part, Scene, Track, VideoFrames, write_page,
 };
 use std::process::Command;
 
@@ -118,7 +118,7 @@ fn scene() -> Scene {
         cloud,
         floor: Some(-1.6),
         tracks: vec![track("prediction", false, 0.0), track("truth", true, 0.05)],
-        confidence: vec![Confidence {
+        certainty: vec![Certainty {
             name: "body".into(),
             values: (0..60).map(|i| i as f32 / 60.0).collect(),
         }],
@@ -128,12 +128,12 @@ fn scene() -> Scene {
 #[test]
 fn the_page_is_one_file_and_keeps_hostile_text_inside() {
     let mut scene = scene();
-    scene.confidence[0].name = "a\"><script>b".into();
+    scene.certainty[0].name = "a\"><script>b".into();
     let mut page = Vec::new();
     write_page(&scene, &mut page).unwrap();
     let page = String::from_utf8(page).unwrap();
     assert!(!page.contains("><script>b"));
-    assert!(page.contains("id=\"blob-confidence-a&quot;&gt;&lt;script&gt;b\""));
+    assert!(page.contains("id=\"blob-certainty-a&quot;&gt;&lt;script&gt;b\""));
     assert!(!page.contains("http://") && !page.contains("https://") && !page.contains("src="));
     assert!(!page.contains("</script><b>"));
     assert!(!page.contains("{{"));

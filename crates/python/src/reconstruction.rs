@@ -102,9 +102,9 @@ impl Reconstruction {
     }
 
     /// By modality, one number per sample: views.
-    fn confidence<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyDict>> {
+    fn certainty<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyDict>> {
         let found = PyDict::new(slf.py());
-        for (name, values) in slf.get().made.confidence() {
+        for (name, values) in slf.get().made.certainty() {
             let values = ArrayView1::from(values.as_slice());
             found.set_item(name, view(values, slf.as_any())?)?;
         }

@@ -25,8 +25,8 @@ def test_arrays_have_the_shapes_units_and_names_that_are_promised(made):
     assert made.gaze.pixels.shape == (105, 2)
     known = made.gaze.valid
     assert np.allclose((made.gaze.pixels[known] + 0.5) / 64, made.gaze.points[known], atol=1e-6)
-    assert set(made.confidence) == {"camera", "gaze", "left_hand", "body"}
-    assert made.body.confidence.shape == (105,)
+    assert set(made.certainty) == {"camera", "gaze", "left_hand", "body"}
+    assert made.body.certainty.shape == (105,)
     assert made.camera.K[0, 0] == pytest.approx(32)  # 90 degrees over 64 pixels
     assert made.body.rate == made.camera.rate == 30
 
@@ -63,8 +63,8 @@ def test_a_folder_gives_the_same_object_as_the_memory_it_was_written_from(made, 
     assert np.array_equal(again.left_hand.positions, made.left_hand.positions, **same)
     assert np.array_equal(again.camera.T_world_camera, made.camera.T_world_camera)
     assert np.array_equal(again.gaze.points, made.gaze.points, **same)
-    for name, values in made.confidence.items():
-        assert np.array_equal(again.confidence[name], values, **same)
+    for name, values in made.certainty.items():
+        assert np.array_equal(again.certainty[name], values, **same)
     assert again.assumptions == made.assumptions
     assert again.page() == made.page()
     assert repr(again) == repr(made)

@@ -72,7 +72,7 @@ def test_gaze_and_pictures_lie_in_the_pinhole(made, recording):
 
 def test_certainty_and_assumptions_are_there(made, recording):
     at, rows = recording["certainty/body"]["Scalars:scalars"]
-    assert np.allclose(np.array(rows)[:, 0], made.body.confidence, atol=1e-6, equal_nan=True)
+    assert np.allclose(np.array(rows)[:, 0], made.body.certainty, atol=1e-6, equal_nan=True)
     (text,) = recording["about"]["TextDocument:text"][1]
     assert "ASSUMED: 90 degrees" in text[0]
 

@@ -28,7 +28,7 @@ impl Reconstruction {
         for (_, track) in self.tracks.iter() {
             track.write(&mut files)?;
         }
-        for (name, values) in &self.confidence {
+        for (name, values) in &self.certainty {
             let facts = files.facts(
                 name,
                 "0 (a guess) to 1 (certain)",
@@ -36,7 +36,7 @@ impl Reconstruction {
                 ScaleStatus::None,
                 None,
             );
-            files.array("confidence.npz", Array1::from(values.clone()), facts);
+            files.array("certainty.npz", Array1::from(values.clone()), facts);
         }
         let (arrays, names) = files.finish()?;
         manifest.arrays.extend(arrays);

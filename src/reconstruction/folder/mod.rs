@@ -70,8 +70,8 @@ pub struct Manifest {
     pub seams: Vec<WindowBoundary>,
     /// How the depth of each window was brought to the scale of the one before it.
     pub depth_seams: Vec<DepthSeam>,
-    /// Mean confidence by modality: from token entropies, 0 (a guess) to 1 (certain). Not an accuracy.
-    pub confidence: BTreeMap<String, f64>,
+    /// Mean certainty by modality: from token entropies, 0 (a guess) to 1 (certain). Not an accuracy.
+    pub certainty: BTreeMap<String, f64>,
     /// The files of the folder, this one included, relative to it and sorted.
     pub files: Vec<String>,
 }
@@ -100,7 +100,7 @@ pub struct Builder {
     video: VideoFrames,
     /// Colours of the frames on the depth grid, for the points.
     colors: Vec<Array3<u8>>,
-    confidence: BTreeMap<String, Vec<f32>>,
+    certainty: BTreeMap<String, Vec<f32>>,
     /// What the depth of the windows means; `None`: up to scale and shift.
     coding: Option<DepthCoding>,
 }
@@ -118,7 +118,7 @@ impl Builder {
             depth: DepthStitcher::default(),
             grids: Vec::new(),
             colors: Vec::new(),
-            confidence: BTreeMap::new(),
+            certainty: BTreeMap::new(),
             coding: None,
         }
     }
@@ -131,7 +131,7 @@ impl Builder {
         self
     }
 
-    /// Adds a window: its frames `[T, S, S, 3]`, the decoded clip, and per modality the confidence of its samples, at any
+    /// Adds a window: its frames `[T, S, S, 3]`, the decoded clip, and per modality the certainty of its samples, at any
     /// rate, over the whole window.
     ///
     /// # Errors
@@ -141,7 +141,7 @@ impl Builder {
         window: &Window,
         rgb: ArrayView4<u8>,
         decoded: &Clip,
-        confidence: &BTreeMap<String, Vec<f32>>,
+        certainty: &BTreeMap<String, Vec<f32>>,
     ) -> Result<(), FolderError> {
         let start = window.start_frame(self.info.video_rate);
         for (index, frame) in rgb.axis_iter(Axis(0)).enumerate() {
@@ -151,13 +151,13 @@ impl Builder {
             }
         }
         self.stitcher.push(window, decoded);
-        for (name, values) in confidence {
+        for (name, values) in certainty {
             if values.is_empty() {
                 continue;
             }
             // Signals have rates of their own: spread over the motion samples of the window.
             let at = |sample: usize| values[sample * values.len() / SIGNAL_SAMPLES];
-            let held = self.confidence.entry(name.clone()).or_default();
+            let held = self.certainty.entry(name.clone()).or_default();
             held.truncate(window.start + window.overlap / 2);
             held.resize(window.start.max(held.len()), f32::NAN);
             let from = held.len() - window.start;
@@ -227,7 +227,7 @@ impl Builder {
                 refused,
                 boundaries: depth_boundaries,
             },
-            confidence: self.confidence,
+            certainty: self.certainty,
             video: self.video,
             grids: self.grids,
             cloud,
@@ -350,7 +350,7 @@ impl Reconstruction {
     #[must_use]
     pub fn manifest(&self) -> Manifest {
         let assumptions = self.info.assumptions.iter();
-        let confidence = self.confidence.iter();
+        let certainty = self.certainty.iter();
         Manifest {
             title: self.info.title.clone(),
             assumptions: assumptions
@@ -365,7 +365,7 @@ impl Reconstruction {
             arrays: Vec::new(),
             seams: self.boundaries.clone(),
             depth_seams: self.depth.boundaries.clone(),
-            confidence: confidence.map(|(k, v)| (k.clone(), mean(v))).collect(),
+            certainty: certainty.map(|(k, v)| (k.clone(), mean(v))).collect(),
             files: Vec::new(),
         }
     }

@@ -9,7 +9,7 @@ use crate::reconstruction::samples::mean_of;
 use crate::reconstruction::stitch::{Tracks, WindowBoundary};
 use crate::reconstruction::track::Timeline;
 use crate::view::scene::{SAMPLE, Tone};
-use crate::view::{Badge, Confidence, DepthGrids, Fact, Part, Scene, Track};
+use crate::view::{Badge, Certainty, DepthGrids, Fact, Part, Scene, Track};
 use ndarray::Array2;
 
 /// Samples that the page draws beside the reconstruction; the file has all of them.
@@ -46,7 +46,7 @@ impl Reconstruction {
         if let Some(reason) = &manifest.refused {
             facts.push(fact("No metric depth", reason));
         }
-        for (name, value) in &manifest.confidence {
+        for (name, value) in &manifest.certainty {
             facts.push(fact(
                 &format!("Token certainty, {name}"),
                 &format!("{value:.2} (1 less the entropy of the tokens; not an accuracy)"),
@@ -94,10 +94,10 @@ impl Reconstruction {
             cloud: self.cloud.clone(),
             floor: self.floor,
             tracks: list,
-            confidence: self
-                .confidence
+            certainty: self
+                .certainty
                 .iter()
-                .map(|(name, values)| Confidence {
+                .map(|(name, values)| Certainty {
                     name: name.clone(),
                     values: values.clone(),
                 })

@@ -32,7 +32,7 @@ const depth = (() => {
   return { ...info, values: new Uint16Array(bytes.buffer, 0, bytes.length >> 1) };
 })();
 const cloud = manifest.cloud ? { ...manifest.cloud, bytes: bytesOf("cloud") } : null;
-const confidence = (manifest.confidence || []).map(c => ({ ...c, values: floatsOf("confidence-" + c.name) }));
+const certainty = (manifest.certainty || []).map(c => ({ ...c, values: floatsOf("certainty-" + c.name) }));
 
 // Video frames are decoded when they are looked at, and a few are kept.
 const video = (() => {

@@ -227,10 +227,10 @@ function pan(dx, dy) {
 canvas.addEventListener("wheel", e => { e.preventDefault(); zoom(Math.exp(e.deltaY * 0.001)); }, { passive: false });
 addEventListener("resize", touch);
 
-function drawConfidence() {
-  const strip = $("confidence"); if (!confidence.length) { strip.hidden = true; return; }
-  const w = strip.width = Math.max(1, strip.clientWidth), h = strip.height, pen = strip.getContext("2d"), row = h / confidence.length;
-  confidence.forEach((c, k) => {
+function drawCertainty() {
+  const strip = $("certainty"); if (!certainty.length) { strip.hidden = true; return; }
+  const w = strip.width = Math.max(1, strip.clientWidth), h = strip.height, pen = strip.getContext("2d"), row = h / certainty.length;
+  certainty.forEach((c, k) => {
     const color = PALETTE[c.name] || [0.6, 0.66, 0.74];
     for (let x = 0; x < w; x++) {
       const v = c.values[Math.floor(x / w * c.values.length)];
@@ -238,7 +238,7 @@ function drawConfidence() {
       pen.fillRect(x, k * row, 1, row - 1);
     }
   });
-  strip.title = "Token certainty (1 less the entropy, not an accuracy), top to bottom: " + confidence.map(c => c.name).join(", ");
+  strip.title = "Token certainty (1 less the entropy, not an accuracy), top to bottom: " + certainty.map(c => c.name).join(", ");
 }
 
 function clockText(s) { const m = Math.floor(s / 60); return `${m}:${(s - 60 * m).toFixed(2).padStart(5, "0")}`; }
@@ -258,7 +258,7 @@ function frame(now) {
 }
 if (!gl) report("This browser has no WebGL2: the 3D scene cannot be drawn. Video, gaze and numbers are shown.");
 const middle = main && pose(main, Math.floor(samples / 2)); if (middle) state.target = add(middle.p, [0, 0.4, -0.6]);
-setCamera("orbit"); addEventListener("resize", drawConfidence); drawConfidence();
+setCamera("orbit"); addEventListener("resize", drawCertainty); drawCertainty();
 const start = /[#&]t=([\d.]+)/.exec(location.hash); if (start) seek(+start[1] * rate);
 if (/[#&]camera=(\w+)/.test(location.hash)) setCamera(/[#&]camera=(\w+)/.exec(location.hash)[1]);
 requestAnimationFrame(frame);

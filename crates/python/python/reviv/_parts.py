@@ -19,7 +19,7 @@ _IMAGE = "upright square image"
 class Joints:
     """21 named joints over time: the body in the world, or a hand in the camera of the same sample."""
 
-    def __init__(self, modality: str, positions: np.ndarray, rate: float, confidence: np.ndarray | None) -> None:
+    def __init__(self, modality: str, positions: np.ndarray, rate: float, certainty: np.ndarray | None) -> None:
         names, parents = _reviv.skeleton(modality)
         self.modality = modality
         #: ``[samples, 21, 3]``, metres, read-only; NaN where unknown.
@@ -33,7 +33,7 @@ class Joints:
         #: The frame of reference, in words.
         self.frame: str = _WORLD if modality == "body" else _CAMERA
         #: ``[samples]``, 0 (a guess) to 1 (certain), by the entropy of the tokens. Not an accuracy.
-        self.confidence: np.ndarray | None = confidence
+        self.certainty: np.ndarray | None = certainty
 
     @property
     def valid(self) -> np.ndarray:
@@ -101,7 +101,7 @@ class CameraPath:
 class Gaze:
     """Where the wearer looks."""
 
-    def __init__(self, points: np.ndarray, rate: float, size: tuple[int, int], confidence: np.ndarray | None) -> None:
+    def __init__(self, points: np.ndarray, rate: float, size: tuple[int, int], certainty: np.ndarray | None) -> None:
         #: ``[samples, 2]``: x right and y down as shares of the upright square image; NaN where unknown.
         self.points: np.ndarray = points
         #: Samples per second.
@@ -111,7 +111,7 @@ class Gaze:
         #: Width and height of the square frames that the model saw, pixels.
         self.size: tuple[int, int] = size
         #: ``[samples]``, 0 (a guess) to 1 (certain). Not an accuracy.
-        self.confidence: np.ndarray | None = confidence
+        self.certainty: np.ndarray | None = certainty
 
     @property
     def pixels(self) -> np.ndarray:

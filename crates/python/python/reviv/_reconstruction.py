@@ -21,7 +21,7 @@ from ._model import Model, load
 from ._parts import CameraPath, Depth, Gaze, Joints, Pictures, Signal, scale_words
 from ._progress import Progress, callback
 
-_CONFIDENCE = "confidence.npz"
+_CERTAINTY = "certainty.npz"
 #: Holds arrays with the names of those of the reconstruction itself.
 _SAMPLES = "samples.npz"
 
@@ -36,7 +36,7 @@ class _Source(Protocol):
     def camera(self) -> np.ndarray | None: ...
     def gaze(self) -> np.ndarray | None: ...
     def depth(self) -> tuple[np.ndarray, float] | None: ...
-    def confidence(self) -> dict[str, np.ndarray]: ...
+    def certainty(self) -> dict[str, np.ndarray]: ...
     def signals(self) -> dict[str, tuple[np.ndarray, float, list[str], list[str]]]: ...
     def samples(self) -> dict[str, np.ndarray]: ...
     def spread(self) -> dict[str, np.ndarray]: ...
@@ -54,9 +54,9 @@ class _Folder:
         try:
             self._manifest: dict[str, Any] = json.loads((path / "manifest.json").read_text("utf-8"))
             entries = self._manifest["arrays"]
-            # Confidence and samples are named after what they are of.
+            # Certainty and samples are named after what they are of.
             self._arrays = {
-                entry["name"]: entry for entry in entries if entry["file"] not in (_CONFIDENCE, _SAMPLES)
+                entry["name"]: entry for entry in entries if entry["file"] not in (_CERTAINTY, _SAMPLES)
             }
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise refused(
@@ -106,17 +106,17 @@ class _Folder:
                 return values, float(self._arrays[name]["rate"])
         return None
 
-    def confidence(self) -> dict[str, np.ndarray]:
+    def certainty(self) -> dict[str, np.ndarray]:
         found = {}
         for entry in self._manifest["arrays"]:
-            if entry["file"] == _CONFIDENCE:
+            if entry["file"] == _CERTAINTY:
                 values = self._of(entry["file"], entry["name"])
                 if values is not None:
                     found[entry["name"]] = values
         return found
 
     def signals(self) -> dict[str, tuple[np.ndarray, float, list[str], list[str]]]:
-        own = {"body.npz", "hands.npz", "camera.npz", "gaze.npz", "depth.npz", _CONFIDENCE, _SAMPLES}
+        own = {"body.npz", "hands.npz", "camera.npz", "gaze.npz", "depth.npz", _CERTAINTY, _SAMPLES}
         found: dict[str, tuple[np.ndarray, float, list[str], list[str]]] = {}
         for entry in self._manifest["arrays"]:
             name = entry["name"]
@@ -181,7 +181,7 @@ class Reconstruction:
 
     @property
     def rate(self) -> float:
-        """Samples per second of camera, gaze, hands, body and confidence."""
+        """Samples per second of camera, gaze, hands, body and certainty."""
         return self._source.rate
 
     @property
@@ -190,15 +190,15 @@ class Reconstruction:
         return {label: value for label, value in self.manifest["assumptions"]}
 
     @cached_property
-    def confidence(self) -> dict[str, np.ndarray]:
+    def certainty(self) -> dict[str, np.ndarray]:
         """By modality ``[samples]``, 0 (a guess) to 1 (certain), by the entropy of the tokens. Not an accuracy."""
-        return self._source.confidence()
+        return self._source.certainty()
 
     def _joints(self, modality: str) -> Joints:
         positions = self._source.joints(modality)
         if positions is None:
             raise self._absent(modality)
-        return Joints(modality, positions, self._source.rate, self.confidence.get(modality))
+        return Joints(modality, positions, self._source.rate, self.certainty.get(modality))
 
     def _absent(self, modality: str) -> Absent:
         return refused(f"`{modality}` was not reconstructed", f"there is {_names(self.modalities)}", Absent)
@@ -234,7 +234,7 @@ class Reconstruction:
             raise self._absent("gaze")
         lens = self.manifest["intrinsics"]
         size = (int(lens["width"]), int(lens["height"]))
-        return Gaze(points, self._source.rate, size, self.confidence.get("gaze"))
+        return Gaze(points, self._source.rate, size, self.certainty.get("gaze"))
 
     @cached_property
     def depth(self) -> Depth:

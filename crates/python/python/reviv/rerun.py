@@ -93,7 +93,7 @@ def log(reconstruction: Reconstruction, recording: Any = None) -> None:
     _pictures(rr, stream, reconstruction)
     if "depth" in reconstruction:
         _depth(rr, stream, reconstruction)
-    for name, values in reconstruction.confidence.items():
+    for name, values in reconstruction.certainty.items():
         _scalars(rr, stream, f"certainty/{name}", values[:, None], reconstruction.rate, [name])
     for name, signal in reconstruction.signals.items():
         _scalars(rr, stream, f"signals/{name}", signal.values, signal.rate, list(signal.channels))
