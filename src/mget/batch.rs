@@ -192,9 +192,13 @@ impl EncoderInput {
         let mut values: Vec<Values> = spec
             .modalities
             .iter()
-            .map(|modality| match modality.input {
-                Input::Tokens { .. } => Values::Ids(Vec::new()),
-                Input::Pixels { .. } => Values::Tubelets(Vec::new()),
+            .enumerate()
+            .map(|(index, modality)| {
+                let Some(each) = modality.tubelet_values() else {
+                    return Values::Ids(Vec::new());
+                };
+                let count: usize = given.clone().map(|inputs| inputs[index].len()).sum();
+                Values::Tubelets(Vec::with_capacity(each * count))
             })
             .collect();
         for (sample, (contents, positions)) in samples.iter().zip(given.clone()).enumerate() {
