@@ -77,8 +77,8 @@ fn rate(work: impl Fn() -> f64) -> f64 {
 /// What earlier runs took, by kind of work.
 #[derive(Debug, Clone, Default)]
 pub struct History {
-    /// Seconds per second that the products alone would take, by op.
-    by_products: BTreeMap<String, Vec<f64>>,
+    /// Seconds that the products alone would have taken, and that it took, by op, and by op and what it works on.
+    by_products: BTreeMap<String, Vec<[f64; 2]>>,
     /// Seconds per unit of work, by op and what it works on.
     by_work: BTreeMap<String, Vec<f64>>,
 }
@@ -101,8 +101,13 @@ impl History {
                 };
                 if let Some(flop) = work.plan["flop"].as_f64().filter(|flop| *flop > 0.0) {
                     let ideal = flop / machine.products;
-                    let of_op = history.by_products.entry(work.op.clone()).or_default();
-                    of_op.push(record.seconds / ideal);
+                    for key in [
+                        work.op.clone(),
+                        one_modality(&work.op, work.settings.json()),
+                    ] {
+                        let seen = history.by_products.entry(key).or_default();
+                        seen.push([ideal, record.seconds]);
+                    }
                 }
                 if let Some(units) = work.plan["work"][0].as_f64().filter(|n| *n > 0.0) {
                     let key = kind(&work.op, work.settings.json());
@@ -125,12 +130,20 @@ impl History {
         units: Option<u64>,
     ) -> Option<f64> {
         if let Some(flop) = flop {
-            let factor = self.by_products.get(op).and_then(|seen| median(seen));
-            return Some(flop / machine.products * factor.unwrap_or(USUAL));
+            let ideal = flop / machine.products;
+            let seen = self.by_products.get(&one_modality(op, settings));
+            let seen = seen.or_else(|| self.by_products.get(op));
+            let [start, factor] = seen.and_then(|seen| line(seen)).unwrap_or([0.0, USUAL]);
+            return Some(start + factor * ideal);
         }
         let each = median(self.by_work.get(&kind(op, settings))?)?;
         Some(each * units? as f64)
     }
+}
+
+/// Trainings of one op on one modality take alike beside their products.
+fn one_modality(op: &str, settings: &serde_json::Value) -> String {
+    format!("{op} {:?}", settings.get("modality"))
 }
 
 /// Work of one op on one modality with one batch has one price per unit.
@@ -138,6 +151,26 @@ fn kind(op: &str, settings: &serde_json::Value) -> String {
     let part = |key: &str| settings.get(key).map(ToString::to_string);
     let parts = ["modality", "batch", "decoding"].map(part);
     format!("{op} {parts:?}")
+}
+
+/// Seconds that every run of an op takes, and how many more per second of its products alone: the line with the least squares of
+/// relative errors through what was seen, with neither below zero.
+fn line(seen: &[[f64; 2]]) -> Option<[f64; 2]> {
+    let [mut xx, mut x1, mut one, mut x, mut unit] = [0.0; 5];
+    for [ideal, took] in seen {
+        let (a, b) = (ideal / took, 1.0 / took);
+        (xx, x1, one) = (xx + a * a, x1 + a * b, one + b * b);
+        (x, unit) = (x + a, unit + b);
+    }
+    let determinant = xx * one - x1 * x1;
+    if determinant > 1e-9 * xx * one {
+        let factor = (x * one - unit * x1) / determinant;
+        let start = (unit * xx - x * x1) / determinant;
+        if factor > 0.0 && start > 0.0 {
+            return Some([start, factor]);
+        }
+    }
+    (xx > 0.0).then(|| [0.0, x / xx])
 }
 
 fn median(values: &[f64]) -> Option<f64> {
@@ -166,10 +199,15 @@ mod tests {
         };
         assert_eq!(of(&history, Some(1e9), None), Some(USUAL));
         assert_eq!(of(&history, None, Some(10)), None);
-        history
-            .by_products
-            .insert("train_mget".into(), vec![9.0, 5.0, 4.0]);
-        assert_eq!(of(&history, Some(2e9), None), Some(10.0));
+        let of_products = |seen: Vec<[f64; 2]>| {
+            let mut history = History::default();
+            history.by_products.insert("train_mget".into(), seen);
+            of(&history, Some(2e9), None).unwrap()
+        };
+        assert!((of_products(vec![[4.0, 20.0]]) - 10.0).abs() < 1e-9);
+        // Two seconds for itself, and three per second of products.
+        let seen = vec![[1.0, 5.0], [4.0, 14.0], [10.0, 32.0]];
+        assert!((of_products(seen) - 8.0).abs() < 1e-9);
         let key = kind("train_mget", &json!({"modality": "body", "batch": 8}));
         history.by_work.insert(key, vec![0.5]);
         assert_eq!(of(&history, None, Some(10)), Some(5.0));

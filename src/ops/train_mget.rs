@@ -15,6 +15,7 @@ use crate::experiment::{
 use crate::masking::statistics::ModalityStatistics;
 use crate::masking::{MaskingError, MaskingSettings, PIXELS, simulate};
 use crate::mget::{MgetSpec, ModalitySpec, Positions, Size, SpecError};
+use crate::training::loader::held_batches;
 use crate::training::{DatasetSize, TrainingSettings, memory};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
@@ -109,7 +110,7 @@ impl Op for TrainMget {
     }
 
     fn version(&self) -> u32 {
-        3
+        4
     }
 
     fn together(&self) -> bool {
@@ -240,8 +241,12 @@ impl Op for TrainMget {
         let mean = |of: fn(&ModalityStatistics) -> f64| -> Vec<f64> {
             masking.modalities.iter().map(of).collect()
         };
-        let floats = memory::mget_floats(&spec, &mean(|m| m.input.mean), &mean(|m| m.target.mean));
-        let peak = memory::peak(parameters, floats * training.largest_micro_batch() as f64);
+        let visible = mean(|m| m.input.mean);
+        let floats = memory::mget_floats(&spec, &visible, &mean(|m| m.target.mean));
+        let at_once = training.largest_micro_batch() as f64;
+        let waiting =
+            held_batches(training.loader_threads) as f64 * memory::mget_pixels(&spec, &visible);
+        let peak = memory::peak(parameters, floats * at_once, waiting * at_once);
         StagePlan {
             shapes: vec![
                 (

@@ -23,7 +23,8 @@ use crate::tokenizer::video::Network;
 use crate::tokenizer::video::padding::Padding;
 use crate::tokenizer::vq::VqVae;
 use crate::training::tokenizer::TokenizerTraining;
-use crate::training::{AdamWSettings, Duration, Keep, memory};
+use crate::training::tokenizer_fit::CALIBRATE;
+use crate::training::{AdamWSettings, Duration, Keep, memory, video_kmeans};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
@@ -155,7 +156,7 @@ impl Op for TrainTokenizer {
     }
 
     fn version(&self) -> u32 {
-        6
+        7
     }
 
     fn together(&self) -> bool {
@@ -305,13 +306,34 @@ impl Op for TrainTokenizer {
         };
         let parameters = parameters(entry, &shape);
         let signals = (settings.steps * settings.batch as u64) as f64;
-        let flop = match entry {
-            // A multiply-accumulate per parameter and token is two operations, and backward costs twice the forward.
-            TokenizerEntry::Vq(_) => {
-                parameters.map(|count| 6.0 * count as f64 * tokens.count() as f64 * signals)
-            }
-            TokenizerEntry::Video(_) => None,
+        let clips = inputs
+            .one("clips")
+            .and_then(|clips| clips.clips.get("train"));
+        let clips = clips.copied().unwrap_or(0) as usize;
+        let [held, centres] = match entry {
+            TokenizerEntry::Video(video) if settings.kmeans => video_kmeans::cost(
+                video,
+                tokens.vocabulary as usize,
+                tokens.count() as usize,
+                clips,
+            ),
+            _ => [0.0; 2],
         };
+        // Beside the steps: the first clips go through the encoder twice, which is half of a network.
+        let beside = CALIBRATE.min(clips) as f64;
+        // A multiply-accumulate is two operations, and backward costs twice the forward.
+        let flop = multiply_accumulates(entry, &shape, parameters, &tokens)
+            .map(|forward| 2.0 * (forward * (3.0 * signals + beside) + centres));
+        let memory = parameters
+            .zip(floats(entry, &shape))
+            .map(|(count, floats)| {
+                let at_once = match settings.micro_batch {
+                    0 => settings.batch,
+                    size => size.min(settings.batch),
+                };
+                let training = memory::peak(count, floats * at_once as f64, 0.0);
+                training.max(memory::afterwards(held))
+            });
         StagePlan {
             shapes: vec![
                 (
@@ -329,15 +351,7 @@ impl Op for TrainTokenizer {
                 mean_target: None,
             }],
             work: Some((settings.steps, "steps".to_owned())),
-            memory: parameters
-                .zip(floats(entry, &shape))
-                .map(|(count, floats)| {
-                    let at_once = match settings.micro_batch {
-                        0 => settings.batch,
-                        size => size.min(settings.batch),
-                    };
-                    memory::peak(count, floats * at_once as f64)
-                }),
+            memory,
             disk: parameters.map(|count| 4 * count),
             flop,
             ..StagePlan::default()
@@ -461,6 +475,31 @@ fn encode_seconds(entry: &TokenizerEntry, shape: &Shape, tokens: &TokenFacts) ->
             Some(4.3 * pixels * (settings.channels as f64 / 128.0).powi(2))
         }
         _ => None,
+    }
+}
+
+/// Multiply-accumulates of a forward pass per signal.
+fn multiply_accumulates(
+    entry: &TokenizerEntry,
+    shape: &Shape,
+    parameters: Option<u64>,
+    tokens: &TokenFacts,
+) -> Option<f64> {
+    match (entry, shape) {
+        // One per parameter and token.
+        (TokenizerEntry::Vq(_), _) => Some(parameters? as f64 * tokens.count() as f64),
+        (
+            TokenizerEntry::Video(settings),
+            Shape::Video {
+                frames,
+                height,
+                width,
+            },
+        ) => Some(memory::video_multiply_accumulates(
+            settings,
+            [*frames, *height, *width],
+        )),
+        (TokenizerEntry::Video(_), _) => None,
     }
 }
 

@@ -71,6 +71,13 @@ pub(super) fn pack(
     Ok(Batch::new(spec, &contents, masks)?)
 }
 
+/// How many micro-batches `threads` threads hold at most while one is trained on.
+#[must_use]
+pub fn held_batches(threads: usize) -> usize {
+    // What waits, and what is being made.
+    threads.max(1) * (AHEAD + 1)
+}
+
 /// Micro-batches in order, from a first step on.
 #[derive(Debug)]
 pub struct Loader {

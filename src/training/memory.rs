@@ -13,12 +13,19 @@ const COPIES: f64 = 4.0;
 /// for the next step, as a share of what the forward pass leaves: an estimate, which `cargo bench --bench plan` puts to the test.
 const BACKWARD: f64 = 1.25;
 /// The program, its threads and its buffers: an estimate, likewise.
-const PROGRAM: f64 = 48e6;
+const PROGRAM: f64 = 30e6;
 
-/// Peak bytes of a training with so many parameters, whose forward pass leaves `floats` numbers per step.
+/// Peak bytes of a training with so many parameters, whose forward pass leaves `floats` numbers per step, beside `held` numbers that are
+/// no activations.
 #[must_use]
-pub fn peak(parameters: u64, floats: f64) -> u64 {
-    (PROGRAM + F32 * (COPIES * parameters as f64 + BACKWARD * floats)) as u64
+pub fn peak(parameters: u64, floats: f64, held: f64) -> u64 {
+    (PROGRAM + F32 * (COPIES * parameters as f64 + BACKWARD * floats + held)) as u64
+}
+
+/// Peak bytes where `floats` numbers are held after the training, whose memory is free by then.
+#[must_use]
+pub fn afterwards(floats: f64) -> u64 {
+    (PROGRAM + F32 * floats) as u64
 }
 
 /// Numbers that a forward pass of MGET leaves per sample, of which `visible` tokens of every modality are seen and `targets` asked for.
@@ -40,18 +47,23 @@ pub fn mget_floats(spec: &MgetSpec, visible: &[f64], targets: &[f64]) -> f64 {
             2.0 * count * modality.vocabulary().unwrap_or(0) as f64
         })
         .sum();
-    let pixels: f64 = spec
-        .modalities
-        .iter()
-        .zip(visible)
-        .map(|(modality, count)| count * modality.tubelet_values().unwrap_or(0) as f64)
-        .sum();
+    let pixels = mget_pixels(spec, visible);
     let ends = 4.0 * d * (n + m);
     spec.size.encoder_depth as f64 * encoder
         + spec.size.decoder_depth as f64 * decoder
         + tables
         + pixels
         + ends
+}
+
+/// Pixels of a sample that MGET sees, of which `visible` tokens of every modality are: what a batch holds that waits for its step.
+#[must_use]
+pub fn mget_pixels(spec: &MgetSpec, visible: &[f64]) -> f64 {
+    spec.modalities
+        .iter()
+        .zip(visible)
+        .map(|(modality, count)| count * modality.tubelet_values().unwrap_or(0) as f64)
+        .sum()
 }
 
 /// Numbers that a forward pass of a VQ-VAE leaves per signal of `tokens` tokens that are patches of `patch` numbers.
@@ -108,4 +120,47 @@ pub fn video_floats(settings: &VideoSettings, [frames, height, width]: [usize; 3
         floats += cells(extents[level]) * 3.0 * own;
     }
     floats
+}
+
+/// Multiply-accumulates of a forward pass of a video tokenizer per video of `[frames, height, width]`: its convolutions, which are
+/// split into one over the picture and one over time.
+#[must_use]
+pub fn video_multiply_accumulates(
+    settings: &VideoSettings,
+    [frames, height, width]: [usize; 3],
+) -> f64 {
+    let convolution = |inputs: f64, outputs: f64| 9.0 * inputs * outputs + 3.0 * outputs * outputs;
+    let residual = |inputs: f64, outputs: f64| {
+        convolution(inputs, outputs) + convolution(outputs, outputs) + inputs * outputs
+    };
+    let patch = settings.patch;
+    let mut extent = [frames.div_ceil(patch) + 1, height / patch, width / patch].map(|n| n as f64);
+    let mut channels = settings.channels as f64;
+    let ends = convolution(settings.coefficients() as f64, channels);
+    let cells = |extent: [f64; 3]| extent.iter().product::<f64>();
+    let mut sum = 2.0 * cells(extent) * ends;
+    let blocks = settings.blocks as f64;
+    for level in 0..settings.multipliers.len() {
+        let own = settings.width(level) as f64;
+        let rest = residual(own, own);
+        // As many blocks on the way up, and one more.
+        sum += cells(extent) * (2.0 * residual(channels, own) + (2.0 * blocks - 1.0) * rest);
+        channels = own;
+        let way = settings.down(level);
+        let halved = |length: f64, halves: bool| {
+            if halves {
+                (length / 2.0).ceil()
+            } else {
+                length
+            }
+        };
+        extent = [
+            halved(extent[0], way.time),
+            halved(extent[1], way.space),
+            halved(extent[2], way.space),
+        ];
+        sum += 2.0 * cells(extent) * convolution(own, own);
+    }
+    // Two residual blocks and two attentions, in the encoder and in the decoder.
+    sum + 2.0 * cells(extent) * (2.0 * residual(channels, channels) + 8.0 * channels * channels)
 }

@@ -1,10 +1,11 @@
 //! From clips to a trained and scored tokenizer of one modality (Sec. 4.2, Supp. A), and to the tokenizers of a model.
 
+use super::epochs::Epochs;
 use super::fit::{Callback, Intervals, fit, progress};
 use super::kmeans::KMeans;
 use super::mixture::Mixture;
 use super::signals::extract;
-use super::tokenizer::{Epochs, TokenizerTraining, mirrored};
+use super::tokenizer::{TokenizerTraining, mirrored};
 use super::tokenizer_scores::{Baselines, Example, Scores, score};
 use super::trainer::ranks::Ranks;
 use super::trainer::{HeldOut, Trainer, TrainingError};
@@ -29,7 +30,7 @@ use std::sync::Arc;
 const CHUNK: usize = 256;
 
 /// Clips that a new network is calibrated on.
-const CALIBRATE: usize = 64;
+pub const CALIBRATE: usize = 64;
 
 /// Clips whose mean is the trivial prediction of a video.
 const MEAN_CLIPS: usize = 64;
@@ -228,11 +229,7 @@ impl TokenizerFit<'_> {
         };
         let read = |index: usize| one(self.train, having[index]);
         if self.calibrate && !having.is_empty() {
-            let mut first = Vec::new();
-            for index in 0..having.len().min(CALIBRATE) {
-                first.extend(read(index)?);
-            }
-            model.calibrate(&first).map_err(TrainingError::from)?;
+            model.calibrate(having.len().min(CALIBRATE), read)?;
         }
         let validation = self.validation();
         let mut trainer = self.together(Trainer::video(model, &self.training)?)?;
@@ -258,6 +255,8 @@ impl TokenizerFit<'_> {
         )?;
         let tokenizer = trainer.objective().tokenizer();
         drop(trainer);
+        // What follows allocates other sizes than the steps did.
+        crate::engine::memory::release();
         let mut mean = vec![0.0_f64; frames * height * width * 3];
         let mut seen = 0.0;
         for index in 0..having.len().min(MEAN_CLIPS) {

@@ -7,7 +7,7 @@ use crate::clip::Signal;
 use crate::random::stream;
 use crate::tokenizer::Tokenizer;
 use crate::tokenizer::video::padding::Padding;
-use crate::tokenizer::video::{VideoTokenizer, haar};
+use crate::tokenizer::video::{VideoSettings, VideoTokenizer, haar};
 
 /// Multiply-accumulates to spend on fitting; codebooks of tens of thousands have no such baseline.
 const WORK: usize = 200_000_000_000;
@@ -49,6 +49,30 @@ impl Blocks {
     }
 }
 
+/// Of how many clips how many blocks each are looked at, where `count` clips have `each` blocks of `width` values; `None` where there
+/// is no clip, or the codebook is too large for the fit.
+fn sampled(width: usize, codes: usize, each: usize, count: usize) -> Option<[usize; 2]> {
+    let most = (WORK / (width * codes * ROUNDS)).min(PATCHES);
+    if count == 0 || most < BLOCKS_PER_CENTRE * codes {
+        return None;
+    }
+    // A few blocks of every clip, or all blocks of some.
+    let share = most.div_ceil(count).clamp(1, each);
+    Some([count.min(most.div_ceil(share)), share])
+}
+
+/// Numbers that the fit holds at once, and its multiply-accumulates, for a tokenizer with these settings of `tokens` tokens and `codes`
+/// codes, and `count` clips.
+#[must_use]
+pub fn cost(settings: &VideoSettings, codes: usize, tokens: usize, count: usize) -> [f64; 2] {
+    let width = settings.temporal * settings.spatial * settings.spatial * COLOURS;
+    sampled(width, codes, tokens, count).map_or([0.0; 2], |[clips, share]| {
+        let values = (clips * share * width) as f64;
+        // The blocks, and once more with the constant that the nearest centre is found by.
+        [2.0 * values, values * (codes * ROUNDS) as f64]
+    })
+}
+
 /// Centres of blocks.
 #[derive(Debug, Clone)]
 pub struct VideoKMeans {
@@ -75,15 +99,12 @@ impl VideoKMeans {
             temporal: settings.temporal,
         };
         let (width, codes) = (blocks.width(), tokenizer.vocabulary());
-        let most = (WORK / (width * codes * ROUNDS)).min(PATCHES);
-        if count == 0 || most < BLOCKS_PER_CENTRE * codes {
-            return Ok(None);
-        }
         let each: usize = tokenizer.grid().iter().product();
-        // A few blocks of every clip, or all blocks of some.
-        let share = most.div_ceil(count).clamp(1, each);
-        let mut rows = Vec::new();
-        for clip in 0..count.min(most.div_ceil(share)) {
+        let Some([clips, share]) = sampled(width, codes, each, count) else {
+            return Ok(None);
+        };
+        let mut rows = Vec::with_capacity(clips * share * width);
+        for clip in 0..clips {
             let Some(signal) = read(clip)? else {
                 continue;
             };

@@ -27,18 +27,26 @@ const QUIET: f32 = 0.1;
 const LEAST: f64 = 1e-2;
 
 impl VideoTokenizer {
-    /// Fits the scales of a new network to `clips`, some of those it will train on.
+    /// Fits the scales of a new network to some clips of those it will train on: `read(i)` is clip `i` of `count`, and is asked for
+    /// twice; clips that it does not give are left out. One clip is held at a time.
     ///
     /// # Errors
-    /// When there are no clips, or one has another size or a value that is not finite.
-    pub fn calibrate(&mut self, clips: &[Signal]) -> Result<(), TokenizerError> {
-        let values = self.checked(clips)?;
-        if values.is_empty() {
-            return Err(TokenizerError::Other("no clips to calibrate on".to_owned()));
-        }
+    /// When there are no clips, or one has another size or a value that is not finite; and those of `read`.
+    pub fn calibrate<E: From<TokenizerError>>(
+        &mut self,
+        count: usize,
+        mut read: impl FnMut(usize) -> Result<Option<Signal>, E>,
+    ) -> Result<(), E> {
         let mut coefficients = Moments::new(self.settings().coefficients());
-        for clip in &values {
-            coefficients.add(&to_host(self.coefficients(&[clip])));
+        let mut any = false;
+        for index in 0..count {
+            for clip in self.checked(read(index)?.as_slice())? {
+                any = true;
+                coefficients.add(&to_host(self.coefficients(&[&clip])));
+            }
+        }
+        if !any {
+            return Err(TokenizerError::Other("no clips to calibrate on".to_owned()).into());
         }
         self.standardise(coefficients.statistics()?)?;
         let mut weights = self.network().weights();
@@ -49,8 +57,10 @@ impl VideoTokenizer {
         centre(&mut weights);
         self.load(&weights)?;
         let mut latents = Whitening::new(self.settings().levels.len());
-        for clip in &values {
-            latents.add(&to_host(self.latents(self.blocks(&[clip]), 1)));
+        for index in 0..count {
+            for clip in self.checked(read(index)?.as_slice())? {
+                latents.add(&to_host(self.latents(self.blocks(&[&clip]), 1)));
+            }
         }
         latents.apply(&mut weights, "quant_conv.conv3d", SPREAD)?;
         for name in ["weight", "bias"] {
@@ -58,7 +68,7 @@ impl VideoTokenizer {
             let rows = self.settings().coefficients();
             floats(&mut weights, &name, rows)?.fill(0.0);
         }
-        self.load(&weights)
+        Ok(self.load(&weights)?)
     }
 
     fn load(&mut self, weights: &Weights) -> Result<(), TokenizerError> {
@@ -170,7 +180,8 @@ mod tests {
     fn a_token_starts_as_a_matter_of_its_own_block() {
         let mut tokenizer = small([5, 32, 32], [16, 8], &[8, 5, 5], 4);
         let clips: Vec<Signal> = (0..4).map(noise).collect();
-        tokenizer.calibrate(&clips).unwrap();
+        let read = |index: usize| Ok::<_, TokenizerError>(Some(clips[index].clone()));
+        tokenizer.calibrate(clips.len(), read).unwrap();
 
         let latents = |clip: &Signal| {
             let values: Vec<f32> = clip.values.iter().copied().collect();

@@ -125,7 +125,8 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         for calibrated in [false, true] {
             if calibrated {
-                one.calibrate(std::slice::from_ref(&signal)).unwrap();
+                one.calibrate(1, |_| Ok::<_, TokenizerError>(Some(signal.clone())))
+                    .unwrap();
             }
             one.write(folder.path()).unwrap();
             let other = crate::tokenizer::open(folder.path(), &Compute::cpu()).unwrap();

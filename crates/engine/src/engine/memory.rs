@@ -33,7 +33,8 @@ const ALIGN: usize = 64;
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Pool;
 
-/// Gives all blocks that are kept back to the system: for the end of a stage. Gives how many bytes that were.
+/// Gives all blocks that are kept back to the system, and what the system's allocator keeps of small ones: for the end of a stage. Gives
+/// how many bytes of blocks that were.
 pub fn release() -> usize {
     let (first, bytes) = SHARED.with(|state| {
         state.most = state.used;
@@ -41,6 +42,11 @@ pub fn release() -> usize {
     });
     // SAFETY: the blocks were taken out of the lists, so nobody else has them.
     unsafe { free_all(first) };
+    #[cfg(all(target_os = "linux", target_env = "gnu"))]
+    // SAFETY: it may be called at any time, from any thread.
+    unsafe {
+        libc::malloc_trim(0);
+    }
     bytes
 }
 
