@@ -95,7 +95,10 @@ impl History {
             for work in &schedule.works {
                 let directory = run.path().join("stages").join(&work.directory);
                 let record = StageRecord::read(&directory);
-                let own = |r: &StageRecord| r.state == State::Done && r.found.is_none();
+                // Of one that was interrupted, not all seconds are known.
+                let own = |r: &StageRecord| {
+                    r.state == State::Done && r.found.is_none() && r.attempts <= 1
+                };
                 let Some(record) = record.filter(own).filter(|r| r.seconds > 0.0) else {
                     continue;
                 };
@@ -143,34 +146,43 @@ impl History {
 
 /// Trainings of one op on one modality take alike beside their products.
 fn one_modality(op: &str, settings: &serde_json::Value) -> String {
-    format!("{op} {:?}", settings.get("modality"))
+    format!("{op} {}", part(settings, "modality"))
 }
 
 /// Work of one op on one modality with one batch has one price per unit.
 fn kind(op: &str, settings: &serde_json::Value) -> String {
-    let part = |key: &str| settings.get(key).map(ToString::to_string);
-    let parts = ["modality", "batch", "decoding"].map(part);
-    format!("{op} {parts:?}")
+    let parts = ["modality", "batch", "decoding"].map(|key| part(settings, key));
+    format!("{op} {}", parts.join(" "))
 }
 
-/// Seconds that every run of an op takes, and how many more per second of its products alone: the line with the least squares of
-/// relative errors through what was seen, with neither below zero.
+fn part(settings: &serde_json::Value, key: &str) -> String {
+    settings
+        .get(key)
+        .map_or_else(|| "-".to_owned(), ToString::to_string)
+}
+
+/// How much ideals have to differ before they say what every run takes beside its products.
+const APART: f64 = 1.5;
+
+/// Seconds that every run of an op takes, and how many more per second of its products alone: the median slope between runs that
+/// differ enough and the median of what is left, or, where that makes no sense, the median ratio.
 fn line(seen: &[[f64; 2]]) -> Option<[f64; 2]> {
-    let [mut xx, mut x1, mut one, mut x, mut unit] = [0.0; 5];
-    for [ideal, took] in seen {
-        let (a, b) = (ideal / took, 1.0 / took);
-        (xx, x1, one) = (xx + a * a, x1 + a * b, one + b * b);
-        (x, unit) = (x + a, unit + b);
-    }
-    let determinant = xx * one - x1 * x1;
-    if determinant > 1e-9 * xx * one {
-        let factor = (x * one - unit * x1) / determinant;
-        let start = (unit * xx - x * x1) / determinant;
-        if factor > 0.0 && start > 0.0 {
-            return Some([start, factor]);
+    let mut slopes = Vec::new();
+    for (index, [x, y]) in seen.iter().enumerate() {
+        for [other, took] in &seen[index + 1..] {
+            if x.max(*other) > APART * x.min(*other) {
+                slopes.push((took - y) / (other - x));
+            }
         }
     }
-    (xx > 0.0).then(|| [0.0, x / xx])
+    if let Some(slope) = median(&slopes).filter(|slope| *slope > 0.0) {
+        let left: Vec<f64> = seen.iter().map(|[x, y]| y - slope * x).collect();
+        if let Some(start) = median(&left).filter(|start| *start > 0.0) {
+            return Some([start, slope]);
+        }
+    }
+    let ratios: Vec<f64> = seen.iter().map(|[x, y]| y / x).collect();
+    median(&ratios).map(|ratio| [0.0, ratio])
 }
 
 fn median(values: &[f64]) -> Option<f64> {
@@ -208,6 +220,16 @@ mod tests {
         // Two seconds for itself, and three per second of products.
         let seen = vec![[1.0, 5.0], [4.0, 14.0], [10.0, 32.0]];
         assert!((of_products(seen) - 8.0).abs() < 1e-9);
+        // One that is off changes little, and what is alike says nothing of its start.
+        let seen = vec![
+            [1.0, 5.0],
+            [3.0, 0.5],
+            [4.0, 14.0],
+            [10.0, 32.0],
+            [12.0, 38.0],
+        ];
+        assert!((of_products(seen) - 8.0).abs() < 1.0);
+        assert!((of_products(vec![[4.0, 20.0], [4.1, 30.0], [4.2, 20.9]]) - 10.0).abs() < 0.1);
         let key = kind("train_mget", &json!({"modality": "body", "batch": 8}));
         history.by_work.insert(key, vec![0.5]);
         assert_eq!(of(&history, None, Some(10)), Some(5.0));

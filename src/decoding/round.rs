@@ -351,7 +351,7 @@ impl<'m, M: TokenModel> Samples<'m, M> {
     }
 }
 
-/// The rows of the `count` surest picks. Saturated confidences tie often: then the probability at temperature 1 decides, then
+/// The rows of the `count` surest picks. Saturated probabilities tie often: then the probability at temperature 1 decides, then
 /// the position.
 fn surest(picks: &[Pick], positions: &[u32], count: usize) -> Vec<usize> {
     let mut order: Vec<usize> = (0..picks.len()).collect();

@@ -4,6 +4,7 @@
 //! from the training split, scores from the validation split. A hand's tokenizer also trains on the other hand in a mirror.
 //! Writes `tokenizer.safetensors`, `scores.json`, `report/tokenizer.md` and a picture.
 
+mod cost;
 mod picture;
 mod report;
 mod run;
@@ -12,19 +13,16 @@ use super::clip_signals::{described_format, modality, unknown_modality};
 use super::modality_entry::{DEFAULTS, read_defaults};
 use super::tokenize::ENCODE_SECONDS;
 use super::tokenizer_entry::TokenizerEntry;
+use crate::engine::DeviceChoice;
 use crate::engine::communicator::reduce::Reduction;
-use crate::engine::{Compute, DeviceChoice, Initialise, Parameters};
 use crate::experiment::{
     Arity, ArtifactKind, Code, Description, Entry, InputFacts, Inputs, Op, OpEntry, Port, Problem,
     StageContext, StageError, StagePlan, TokenFacts, TokenPlan,
 };
 use crate::modality::Shape;
-use crate::tokenizer::video::Network;
 use crate::tokenizer::video::padding::Padding;
-use crate::tokenizer::vq::VqVae;
 use crate::training::tokenizer::TokenizerTraining;
-use crate::training::tokenizer_fit::CALIBRATE;
-use crate::training::{AdamWSettings, Duration, Keep, memory, video_kmeans};
+use crate::training::{AdamWSettings, Duration, Keep};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
@@ -266,7 +264,11 @@ impl Op for TrainTokenizer {
                     ("tokenizer".to_owned(), json!(entry.name)),
                     (
                         ENCODE_SECONDS.to_owned(),
-                        json!(encode_seconds(&entry.settings, &modality.shape(), &tokens)),
+                        json!(cost::encode_seconds(
+                            &entry.settings,
+                            &modality.shape(),
+                            &tokens
+                        )),
                     ),
                 ]
                 .into(),
@@ -304,36 +306,10 @@ impl Op for TrainTokenizer {
         let Ok(tokens) = tokens(entry, &shape) else {
             return StagePlan::default();
         };
-        let parameters = parameters(entry, &shape);
-        let signals = (settings.steps * settings.batch as u64) as f64;
-        let clips = inputs
-            .one("clips")
-            .and_then(|clips| clips.clips.get("train"));
-        let clips = clips.copied().unwrap_or(0) as usize;
-        let [held, centres] = match entry {
-            TokenizerEntry::Video(video) if settings.kmeans => video_kmeans::cost(
-                video,
-                tokens.vocabulary as usize,
-                tokens.count() as usize,
-                clips,
-            ),
-            _ => [0.0; 2],
-        };
-        // Beside the steps: the first clips go through the encoder twice, which is half of a network.
-        let beside = CALIBRATE.min(clips) as f64;
-        // A multiply-accumulate is two operations, and backward costs twice the forward.
-        let flop = multiply_accumulates(entry, &shape, parameters, &tokens)
-            .map(|forward| 2.0 * (forward * (3.0 * signals + beside) + centres));
-        let memory = parameters
-            .zip(floats(entry, &shape))
-            .map(|(count, floats)| {
-                let at_once = match settings.micro_batch {
-                    0 => settings.batch,
-                    size => size.min(settings.batch),
-                };
-                let training = memory::peak(count, floats * at_once as f64, 0.0);
-                training.max(memory::afterwards(held))
-            });
+        let parameters = cost::parameters(entry, &shape);
+        let clips = clips_of(inputs.all("clips"), "train") as usize;
+        let flop = cost::flop(settings, entry, &shape, &tokens, clips);
+        let memory = cost::memory(settings, entry, &shape, &tokens, clips);
         StagePlan {
             shapes: vec![
                 (
@@ -453,88 +429,6 @@ fn tokens(entry: &TokenizerEntry, shape: &Shape) -> Result<TokenFacts, String> {
             Err("a video tokenizer takes video; other signals have a VQ-VAE".to_owned())
         }
     }
-}
-
-/// Seconds of one core to make the tokens of a clip, an order of magnitude: products at 90 GFLOP/s for the encoder, which is half
-/// of a VQ-VAE; a video tokenizer by its pixels and the square of its width beside Cosmos DV4x8x8 (benches/results.md).
-fn encode_seconds(entry: &TokenizerEntry, shape: &Shape, tokens: &TokenFacts) -> Option<f64> {
-    match (entry, shape) {
-        (TokenizerEntry::Vq(_), _) => {
-            let parameters = parameters(entry, shape)?;
-            Some(parameters as f64 * tokens.count() as f64 / 90e9)
-        }
-        (
-            TokenizerEntry::Video(settings),
-            Shape::Video {
-                frames,
-                height,
-                width,
-            },
-        ) => {
-            let pixels = (frames * height * width) as f64 / (17.0 * 256.0 * 256.0);
-            Some(4.3 * pixels * (settings.channels as f64 / 128.0).powi(2))
-        }
-        _ => None,
-    }
-}
-
-/// Multiply-accumulates of a forward pass per signal.
-fn multiply_accumulates(
-    entry: &TokenizerEntry,
-    shape: &Shape,
-    parameters: Option<u64>,
-    tokens: &TokenFacts,
-) -> Option<f64> {
-    match (entry, shape) {
-        // One per parameter and token.
-        (TokenizerEntry::Vq(_), _) => Some(parameters? as f64 * tokens.count() as f64),
-        (
-            TokenizerEntry::Video(settings),
-            Shape::Video {
-                frames,
-                height,
-                width,
-            },
-        ) => Some(memory::video_multiply_accumulates(
-            settings,
-            [*frames, *height, *width],
-        )),
-        (TokenizerEntry::Video(_), _) => None,
-    }
-}
-
-/// Numbers that a forward pass leaves per signal.
-fn floats(entry: &TokenizerEntry, shape: &Shape) -> Option<f64> {
-    match (entry, shape) {
-        (TokenizerEntry::Vq(settings), _) => {
-            let patches = settings.patches(shape).ok()?;
-            Some(memory::vq_floats(
-                settings,
-                patches.tokens(),
-                patches.width(),
-            ))
-        }
-        (
-            TokenizerEntry::Video(settings),
-            Shape::Video {
-                frames,
-                height,
-                width,
-            },
-        ) => Some(memory::video_floats(settings, [*frames, *height, *width])),
-        (TokenizerEntry::Video(_), _) => None,
-    }
-}
-
-/// How many trainable numbers the tokenizer has; nothing is allocated.
-fn parameters(entry: &TokenizerEntry, shape: &Shape) -> Option<u64> {
-    let compute = Compute::cpu();
-    let planned = Initialise::meta(&compute);
-    let count = match entry {
-        TokenizerEntry::Vq(settings) => VqVae::new(&planned, settings, shape).ok()?.count(),
-        TokenizerEntry::Video(settings) => Network::new(&planned, settings).ok()?.count(),
-    };
-    Some(count as u64)
 }
 
 #[cfg(test)]

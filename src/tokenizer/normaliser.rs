@@ -184,12 +184,14 @@ fn shift_joints(sample: &mut [f32], sign: f32) {
 fn each_valid(signal: &Signal, root: Option<usize>, mut visit: impl FnMut(usize, f64)) {
     let channels = signal.values.shape().last().copied().unwrap_or(1).max(1);
     let values = signal.values.as_standard_layout();
-    let values = values.as_slice().unwrap_or_default();
+    let values = values.as_slice().expect("standard layout");
     let valid = signal
         .valid
         .as_ref()
         .map(|valid| valid.as_standard_layout());
-    let valid = valid.as_ref().and_then(|valid| valid.as_slice());
+    let valid = valid
+        .as_ref()
+        .map(|valid| valid.as_slice().expect("standard layout"));
     let is_valid = |i: usize| valid.is_none_or(|valid| valid[i / channels]);
     for (i, value) in values.iter().enumerate().filter(|(i, _)| is_valid(*i)) {
         let first = root.map(|width| i / width * width + i % AXES);

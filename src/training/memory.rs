@@ -2,7 +2,6 @@
 //! backward pass, counted from the layers. `cargo bench --bench plan` compares with what trainings were seen to take.
 
 use crate::mget::MgetSpec;
-use crate::tokenizer::video::VideoSettings;
 use crate::tokenizer::vq::VqSettings;
 
 /// Bytes of a number.
@@ -75,92 +74,4 @@ pub fn vq_floats(settings: &VqSettings, tokens: usize, patch: usize) -> f64 {
     // Distances to all codes.
     let codes = 2.0 * n * settings.codebook as f64;
     2.0 * settings.depth as f64 * block + ends + codes
-}
-
-/// Numbers that a forward pass of a video tokenizer leaves per video of `[frames, height, width]`.
-#[must_use]
-pub fn video_floats(settings: &VideoSettings, [frames, height, width]: [usize; 3]) -> f64 {
-    let patch = settings.patch;
-    // The first frame stands for a whole block.
-    let mut extent = [frames.div_ceil(patch) + 1, height / patch, width / patch];
-    if patch == 1 {
-        extent[0] = frames;
-    }
-    let residual = |inputs: f64, outputs: f64| 2.0 * inputs + 7.0 * outputs;
-    let cells = |e: [usize; 3]| e.iter().product::<usize>() as f64;
-    let halved = |e: [usize; 3], space: bool, time: bool| {
-        let side = |n: usize| if space { n.div_ceil(2) } else { n };
-        let first = if time { e[0].div_ceil(2) } else { e[0] };
-        [first, side(e[1]), side(e[2])]
-    };
-    let levels = settings.multipliers.len();
-    let mut floats = 2.0 * cells(extent) * (2 * settings.coefficients() + settings.channels) as f64;
-    let mut channels = settings.channels as f64;
-    let mut extents = Vec::new();
-    for level in 0..levels {
-        let own = settings.width(level) as f64;
-        extents.push(extent);
-        for _ in 0..settings.blocks {
-            floats += cells(extent) * residual(channels, own);
-            channels = own;
-        }
-        let way = settings.down(level);
-        extent = halved(extent, way.space, way.time);
-        floats += cells(extent) * 3.0 * own;
-    }
-    // Two residual blocks and two attentions, in the encoder and in the decoder.
-    floats += 2.0 * cells(extent) * channels * (2.0 * 9.0 + 2.0 * 8.0);
-    for level in (0..levels).rev() {
-        let own = settings.width(level) as f64;
-        let here = extents.get(level + 1).copied().unwrap_or(extent);
-        for _ in 0..=settings.blocks {
-            floats += cells(here) * residual(channels, own);
-            channels = own;
-        }
-        floats += cells(extents[level]) * 3.0 * own;
-    }
-    floats
-}
-
-/// Multiply-accumulates of a forward pass of a video tokenizer per video of `[frames, height, width]`: its convolutions, which are
-/// split into one over the picture and one over time.
-#[must_use]
-pub fn video_multiply_accumulates(
-    settings: &VideoSettings,
-    [frames, height, width]: [usize; 3],
-) -> f64 {
-    let convolution = |inputs: f64, outputs: f64| 9.0 * inputs * outputs + 3.0 * outputs * outputs;
-    let residual = |inputs: f64, outputs: f64| {
-        convolution(inputs, outputs) + convolution(outputs, outputs) + inputs * outputs
-    };
-    let patch = settings.patch;
-    let mut extent = [frames.div_ceil(patch) + 1, height / patch, width / patch].map(|n| n as f64);
-    let mut channels = settings.channels as f64;
-    let ends = convolution(settings.coefficients() as f64, channels);
-    let cells = |extent: [f64; 3]| extent.iter().product::<f64>();
-    let mut sum = 2.0 * cells(extent) * ends;
-    let blocks = settings.blocks as f64;
-    for level in 0..settings.multipliers.len() {
-        let own = settings.width(level) as f64;
-        let rest = residual(own, own);
-        // As many blocks on the way up, and one more.
-        sum += cells(extent) * (2.0 * residual(channels, own) + (2.0 * blocks - 1.0) * rest);
-        channels = own;
-        let way = settings.down(level);
-        let halved = |length: f64, halves: bool| {
-            if halves {
-                (length / 2.0).ceil()
-            } else {
-                length
-            }
-        };
-        extent = [
-            halved(extent[0], way.time),
-            halved(extent[1], way.space),
-            halved(extent[2], way.space),
-        ];
-        sum += 2.0 * cells(extent) * convolution(own, own);
-    }
-    // Two residual blocks and two attentions, in the encoder and in the decoder.
-    sum + 2.0 * cells(extent) * (2.0 * residual(channels, channels) + 8.0 * channels * channels)
 }

@@ -6,7 +6,7 @@
 //! Of several ranks each may keep the moments of its stretch of the parameters alone ([`AdamW::shard`]). It moves that stretch, and the
 //! ranks tell each other what became of theirs; every number comes out as if one rank had moved all of them.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use burn::tensor::{Tensor, TensorData};
 use schemars::JsonSchema;
@@ -14,7 +14,7 @@ use serde::{Deserialize, Serialize};
 
 use super::muon;
 use crate::engine::communicator::shard::Shard;
-use crate::engine::ops::{self, AdamWStep, MuonParameter, Norm};
+use crate::engine::ops::{self, AdamWStep, MuonParameter};
 use crate::engine::parameters::{Kind, to_host};
 use crate::engine::{
     Communicator, Device, EngineError, Gradients, HostTensor, Parameters, RankError, Values,
@@ -37,8 +37,8 @@ pub struct AdamWSettings {
     /// exchange of all weights a step, and the same bytes. One rank keeps everything.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub shard: bool,
-    /// Muon for the matrices inside blocks: their momentum is made orthogonal first. Everything else steps as before. Not with `shard`:
-    /// the step of a matrix needs all of it.
+    /// Muon for the matrices inside blocks: their momentum is made orthogonal first, and their gradients are not clipped. Everything else
+    /// steps as before. Not with `shard`: the step of a matrix needs all of it.
     #[serde(skip_serializing_if = "std::ops::Not::not")]
     pub muon: bool,
 }
@@ -114,6 +114,14 @@ pub struct NotFinite {
     pub norm: f64,
 }
 
+/// Refuses step `step` where the norm of its gradient is known and not finite.
+fn refuse(step: u64, norm: Option<f64>) -> Result<(), NotFinite> {
+    match norm {
+        Some(norm) if !norm.is_finite() => Err(NotFinite { step, norm }),
+        _ => Ok(()),
+    }
+}
+
 impl AdamW {
     /// A fresh optimizer for the trainable parameters of `model`.
     #[must_use]
@@ -185,17 +193,18 @@ impl AdamW {
         mut gradients: Gradients,
         rate: f64,
     ) -> Result<f64, NotFinite> {
-        let mut norm = gradients.norm();
-        if self.settings.muon || self.shard.is_some() {
-            // Muon's step on a device does not refuse itself, and what a share has moved is told to the other ranks at once.
-            norm = Norm::Host(norm.read());
-        }
-        if let Some(norm) = norm.known() {
-            self.check(norm)?;
-        }
-        self.step += 1;
+        let norm = gradients.norm();
+        // On a device a step refuses itself, and nobody waits for the norm. But Muon's does not, and what a share has moved is told to the
+        // other ranks at once.
+        let known = if self.settings.muon || self.shard.is_some() {
+            Some(norm.read())
+        } else {
+            norm.known()
+        };
+        let next = self.step + 1;
+        refuse(next, known)?;
         let settings = &self.settings;
-        let exponent = i32::try_from(self.step).unwrap_or(i32::MAX);
+        let exponent = i32::try_from(next).unwrap_or(i32::MAX);
         let mut step = AdamWStep {
             clip: settings.clip_norm,
             betas: settings.betas,
@@ -237,6 +246,7 @@ impl AdamW {
                 let square = Some(square);
                 moments.insert(name.to_owned(), Moments { mean, square });
             });
+            self.step = next;
             return Ok(norm.read());
         }
         let (mut with_muon, mut names) = (Vec::new(), Vec::new());
@@ -263,7 +273,8 @@ impl AdamW {
             names.push((name.to_owned(), tracked));
             with_muon.push(MuonParameter {
                 shape: [rows, columns],
-                matrices: muon::matrices(name, &[rows, columns]).unwrap_or(1),
+                matrices: muon::matrices(name, &[rows, columns])
+                    .expect("moments without squares are Muon's"),
                 values: parameter.take(),
                 gradient,
                 momentum: state.mean,
@@ -281,23 +292,10 @@ impl AdamW {
                 moments.insert(name.to_owned(), Moments { mean, square: None });
             }
         });
-        // On a device the step has refused itself; nobody has waited for it so far.
         let norm = norm.read();
-        self.step -= 1;
-        self.check(norm)?;
-        self.step += 1;
+        refuse(next, Some(norm))?;
+        self.step = next;
         Ok(norm)
-    }
-
-    /// Refuses the next step where the norm of its gradient is not finite.
-    fn check(&self, norm: f64) -> Result<(), NotFinite> {
-        if norm.is_finite() {
-            return Ok(());
-        }
-        Err(NotFinite {
-            step: self.step + 1,
-            norm,
-        })
     }
 
     /// Ends a step where the state is sharded: every rank gets from all what they have moved. Does nothing where it is not.
@@ -383,12 +381,14 @@ impl AdamW {
                 .collect()
         };
         let mut restored = BTreeMap::new();
-        let mut arrays = 1;
+        let mut known = BTreeSet::from(["step".to_owned()]);
         for (name, length) in &names {
             // What other ranks keep must be there too.
-            let read = |kind: &str| {
+            let mut read = |kind: &str| {
                 let name = format!("{kind}.{name}");
-                state.get(&name, &[*length])?.f32(&name)
+                let values = state.get(&name, &[*length])?.f32(&name)?;
+                known.insert(name);
+                Ok::<_, EngineError>(values)
             };
             let with_muon = self.moments.get(name).is_some_and(|m| m.square.is_none());
             let mean = read("exp_avg")?;
@@ -397,7 +397,6 @@ impl AdamW {
             } else {
                 Some(read("exp_avg_sq")?)
             };
-            arrays += 1 + usize::from(square.is_some());
             let Some(moments) = self.moments.get(name) else {
                 continue;
             };
@@ -410,20 +409,13 @@ impl AdamW {
             };
             restored.insert(name.clone(), pair);
         }
-        let unknown = state.tensors.len().saturating_sub(arrays);
-        if unknown > 0 {
-            let known = |key: &str| {
-                let name = key.split_once('.').map_or("", |parts| parts.1);
-                names.iter().any(|(known, _)| known == name)
-            };
+        let unknown: Vec<_> = (state.tensors.keys())
+            .filter(|key| !known.contains(*key))
+            .collect();
+        if let Some(first) = unknown.first() {
             return Err(EngineError::Unknown {
-                count: unknown,
-                first: state
-                    .tensors
-                    .keys()
-                    .find(|key| !known(key))
-                    .cloned()
-                    .unwrap_or_default(),
+                count: unknown.len(),
+                first: (*first).clone(),
             });
         }
         self.step = u64::try_from(step).unwrap_or(0);

@@ -1,8 +1,8 @@
 //! glTF 2.0 (binary) with the wearer's skeletons and the camera, animated: opens in Blender, three.js, Windows and macOS viewers.
 //!
 //! A skeleton is a skin whose joints turn as in [`super::bvh`] and move as observed, so that every joint is exactly where it was
-//! reconstructed; bones are small octahedra. Metres, y up, x right, as glTF has it; a frame with an unknown joint repeats the one
-//! before it.
+//! reconstructed; bones are small octahedra. Metres, y up, x right, as glTF has it; a frame with an unknown joint repeats the
+//! last whole one, or the first.
 
 use super::bvh::{children, from_camera, from_z_up, rest_offsets, rotations, whole_poses};
 use crate::clip::Intrinsics;

@@ -31,7 +31,7 @@ impl VideoTokenizer {
     /// twice; clips that it does not give are left out. One clip is held at a time.
     ///
     /// # Errors
-    /// When there are no clips, or one has another size or a value that is not finite; and those of `read`.
+    /// When there are no clips, or one has another size or a value that is not finite; and those of `read`. The network is of no use then.
     pub fn calibrate<E: From<TokenizerError>>(
         &mut self,
         count: usize,
@@ -40,7 +40,8 @@ impl VideoTokenizer {
         let mut coefficients = Moments::new(self.settings().coefficients());
         let mut any = false;
         for index in 0..count {
-            for clip in self.checked(read(index)?.as_slice())? {
+            if let Some(signal) = read(index)? {
+                let clip = self.checked_one(index, &signal)?;
                 any = true;
                 coefficients.add(&to_host(self.coefficients(&[&clip])));
             }
@@ -58,7 +59,8 @@ impl VideoTokenizer {
         self.load(&weights)?;
         let mut latents = Whitening::new(self.settings().levels.len());
         for index in 0..count {
-            for clip in self.checked(read(index)?.as_slice())? {
+            if let Some(signal) = read(index)? {
+                let clip = self.checked_one(index, &signal)?;
                 latents.add(&to_host(self.latents(self.blocks(&[&clip]), 1)));
             }
         }

@@ -4,10 +4,11 @@
 //! Read in this order: [`settings`] (sizes, and from them every layer), [`haar`] (pixels to wavelet coefficients and back),
 //! [`layers`] (convolution, norm, residual block, attention, resampling), [`network`] (encoder and decoder, parameters named as
 //! in NVIDIA's files), [`fsq`] (latents to tokens), [`padding`] (clips to the lengths and sizes the network takes) and
-//! [`tokenizer`] (signals to tokens and back, and one training step), [`calibrate`] (before the first step), [`stored`] (the
-//! file).
+//! [`tokenizer`] (signals to tokens and back, and one training step), [`calibrate`] (before the first step), [`cost`] (what it
+//! takes), [`stored`] (the file).
 
 pub mod calibrate;
+pub mod cost;
 pub mod fsq;
 pub mod haar;
 pub mod layers;

@@ -251,50 +251,55 @@ impl VideoTokenizer {
 
     /// The values of signals, row-major, checked for shape and finiteness.
     pub(super) fn checked(&self, signals: &[Signal]) -> Result<Vec<Vec<f32>>, TokenizerError> {
+        let signals = signals.iter().enumerate();
+        signals
+            .map(|(index, signal)| self.checked_one(index, signal))
+            .collect()
+    }
+
+    /// The same of one that is called `index` in errors.
+    pub(super) fn checked_one(
+        &self,
+        index: usize,
+        signal: &Signal,
+    ) -> Result<Vec<f32>, TokenizerError> {
         let [frames, height, width] = self.padding.clip;
-        let expected = vec![frames, height, width, COLOURS];
-        let mut all = Vec::with_capacity(signals.len());
-        for (index, signal) in signals.iter().enumerate() {
-            if signal.values.shape() != expected {
-                return Err(TokenizerError::Shape {
-                    modality: self.modality.clone(),
-                    index,
-                    found: signal.values.shape().to_vec(),
-                    expected,
-                });
+        let expected = [frames, height, width, COLOURS];
+        let fits = |found: &[usize], expected: &[usize]| {
+            if found == expected {
+                return Ok(());
             }
-            let mut values: Vec<f32> = signal.values.iter().copied().collect();
-            if let Some(valid) = &signal.valid {
-                if valid.shape() != &expected[..3] {
-                    return Err(TokenizerError::Shape {
-                        modality: self.modality.clone(),
-                        index,
-                        found: valid.shape().to_vec(),
-                        expected: expected[..3].to_vec(),
-                    });
-                }
-                for (pixel, valid) in values.chunks_exact_mut(COLOURS).zip(valid) {
-                    if !valid {
-                        pixel.fill(0.0);
-                    }
+            Err(TokenizerError::Shape {
+                modality: self.modality.clone(),
+                index,
+                found: found.to_vec(),
+                expected: expected.to_vec(),
+            })
+        };
+        fits(signal.values.shape(), &expected)?;
+        let mut values: Vec<f32> = signal.values.iter().copied().collect();
+        if let Some(valid) = &signal.valid {
+            fits(valid.shape(), &expected[..3])?;
+            for (pixel, valid) in values.chunks_exact_mut(COLOURS).zip(valid) {
+                if !valid {
+                    pixel.fill(0.0);
                 }
             }
-            if let Some(at) = values.iter().position(|v| !v.is_finite()) {
-                let pixel = at / COLOURS;
-                return Err(TokenizerError::NotFinite {
-                    modality: self.modality.clone(),
-                    index,
-                    position: vec![
-                        pixel / (height * width),
-                        pixel / width % height,
-                        pixel % width,
-                        at % COLOURS,
-                    ],
-                });
-            }
-            all.push(values);
         }
-        Ok(all)
+        if let Some(at) = values.iter().position(|v| !v.is_finite()) {
+            let pixel = at / COLOURS;
+            return Err(TokenizerError::NotFinite {
+                modality: self.modality.clone(),
+                index,
+                position: vec![
+                    pixel / (height * width),
+                    pixel / width % height,
+                    pixel % width,
+                    at % COLOURS,
+                ],
+            });
+        }
+        Ok(values)
     }
 }
 

@@ -1,9 +1,8 @@
 //! Torch files that are no archives, as torch wrote them before 1.6 and still does when asked to: five pickles (a magic number,
 //! the version, the machine, the objects, the keys of the storages), then every storage with its number of elements.
 
-use super::CheckpointError;
 use super::memory::identify;
-use super::{Checkpoint, Source, tree};
+use super::{Checkpoint, CheckpointError, Source, tree};
 use crate::formats::pickle::{Node, Pickle, Scalar};
 use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;

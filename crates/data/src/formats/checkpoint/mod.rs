@@ -150,6 +150,9 @@ enum Container {
 
 impl Checkpoint {
     /// Opens a checkpoint and checks its structure; no tensor is read.
+    ///
+    /// # Errors
+    /// When it cannot be read, is of no known container, or breaks the rules of its own.
     pub fn open(path: &Path) -> Result<Self, CheckpointError> {
         let refused = |reason: String| CheckpointError::refused(path, reason);
         let facts = std::fs::metadata(path).map_err(CheckpointError::io(path))?;

@@ -1,8 +1,7 @@
 //! Safetensors: a JSON header with types, shapes and places, then the values.
 
-use super::CheckpointError;
 use super::memory::identify;
-use super::{Checkpoint, Format, Source};
+use super::{Checkpoint, CheckpointError, Format, Source};
 use crate::formats::pickle::{Scalar, Storage, TensorView};
 use serde_json::{Map, Value};
 use std::collections::BTreeSet;

@@ -1,7 +1,6 @@
 //! Values of entries, in pieces.
 
-use super::CheckpointError;
-use super::{Checkpoint, Source};
+use super::{Checkpoint, CheckpointError, Source};
 use crate::formats::pickle::{Scalar, TensorView};
 use std::io::{Read, Seek, SeekFrom};
 use std::path::Path;
@@ -83,6 +82,9 @@ impl Checkpoint {
     }
 
     /// All values of an entry at once (for small ones).
+    ///
+    /// # Errors
+    /// As [`Checkpoint::stream`].
     pub fn values(&mut self, index: usize) -> Result<Vec<f32>, CheckpointError> {
         let mut all = Vec::with_capacity(self.entries[index].view.elements() as usize);
         self.stream::<CheckpointError>(index, &mut |piece| {

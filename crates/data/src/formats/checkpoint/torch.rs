@@ -1,8 +1,7 @@
 //! Torch archives: a zip with one pickle that describes tensors, and one stored member per storage.
 
-use super::CheckpointError;
 use super::memory::identify;
-use super::{Checkpoint, Source, tree};
+use super::{Checkpoint, CheckpointError, Source, tree};
 use crate::formats::FormatError;
 use crate::formats::pickle::Pickle;
 use crate::formats::zip::{Method, ZipArchive};

@@ -38,6 +38,7 @@ const COUNTERS: [&str; 3] = ["n_averaged", "num_updates", "decay"];
 
 impl Checkpoint {
     /// Whether a wrapper lies around layers, within names.
+    #[must_use]
     pub fn has_wrapped_layers(&self) -> bool {
         let wrapped = |name: &str| name.split('.').any(|part| ANYWHERE.contains(&part));
         self.entries.iter().any(|entry| wrapped(&entry.name))

@@ -44,8 +44,19 @@ impl MuonParameter {
 }
 
 /// One step of each parameter, at learning rate `rate`: its new values and momentum, in place where nobody else holds them.
+///
+/// # Panics
+/// When a parameter is no stack of matrices, or its gradient or momentum has another length.
 #[must_use]
 pub fn muon(parameters: Vec<MuonParameter>, rate: f64) -> Vec<(Tensor<1>, Tensor<1>)> {
+    for parameter in &parameters {
+        let [rows, columns] = parameter.shape;
+        let whole = parameter.matrices > 0 && rows.is_multiple_of(parameter.matrices);
+        assert!(whole && rows * columns > 0, "matrices of one shape");
+        let arrays = [&parameter.values, &parameter.gradient, &parameter.momentum];
+        let fit = arrays.map(|array| array.dims() == [rows * columns]);
+        assert_eq!(fit, [true; 3], "arrays of the parameter's size");
+    }
     if parameters.iter().all(|one| fused::takes(&one.values)) {
         return fused::muon(parameters, rate);
     }
