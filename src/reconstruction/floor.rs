@@ -82,16 +82,16 @@ impl Default for FloorFit {
             rule: FloorRule::LowestHalf,
             lowest: 0.05,
             repeats: 5,
-            max_residual: 0.25,
+            max_residual: 0.1,
             outlier: 0.3,
-            max_outliers: 0.4,
-            tolerance: 0.05,
-            support: 0.04,
+            max_outliers: 0.1,
+            tolerance: 0.03,
+            support: 0.1,
             spread: 0.12,
             information: 4.0,
             max_scale: 5.0,
             max_shift: 2.0,
-            agreement: 0.15,
+            agreement: 0.08,
         }
     }
 }
