@@ -140,6 +140,30 @@ fn mutated(mut bytes: Vec<u8>, flips: &[(usize, u8)], keep: usize) -> Vec<u8> {
     bytes
 }
 
+#[test]
+fn a_sample_description_that_is_not_there_is_an_error_of_the_frame() {
+    let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/synthetic_30fps.mp4");
+    let mut bytes = std::fs::read(data).unwrap();
+    let stsc = bytes.windows(4).position(|name| name == b"stsc").unwrap();
+    // Name, version and flags, how many runs; first chunk, samples per chunk, description.
+    bytes[stsc + 20..stsc + 24].copy_from_slice(&7_u32.to_be_bytes());
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("no_description.mp4");
+    std::fs::write(&path, bytes).unwrap();
+    let settings = reviv::video::VideoSettings {
+        decoder: reviv::video::DecoderChoice::Embedded,
+        ..Default::default()
+    };
+    let error = match Video::open_with(&path, &settings) {
+        Err(error) => error,
+        Ok(video) => {
+            let mut frames = video.frames(0..20).unwrap();
+            frames.find_map(Result::err).unwrap()
+        }
+    };
+    assert!(error_names(&path, &error), "{error}");
+}
+
 fn error_names(path: &Path, error: &ReadError) -> bool {
     error
         .to_string()

@@ -173,7 +173,9 @@ impl Index {
                 return Ok(false);
             }
             read(&self.path, &mut file, sample, &mut bytes)?;
-            Ok(self.configurations[usize::from(sample.entry)].is_start(&bytes))
+            // One that does not exist shows when the frame is asked for.
+            let configuration = self.configurations.get(usize::from(sample.entry));
+            Ok(configuration.is_some_and(|configuration| configuration.is_start(&bytes)))
         };
         let mut parts: Vec<Part> = Vec::new();
         // Ranks up to where the last part reaches: from there on another one starts.
