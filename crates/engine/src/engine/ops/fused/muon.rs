@@ -101,7 +101,9 @@ fn orthogonal(mut x: Vec<f32>, [rows, columns]: [usize; 2]) -> Vec<f32> {
         || vector::dot(&x, &x),
     );
     let scale = 1.0 / (norm.sqrt() + NORM_EPSILON);
-    x.iter_mut().for_each(|x| *x *= scale);
+    for value in &mut x {
+        *value *= scale;
+    }
     let [a, b, c] = COEFFICIENTS.map(|coefficient| coefficient as f32);
     let (mut gram, mut polynomial) = (vec![0.0; side * side], vec![0.0; side * side]);
     let mut next = vec![0.0; x.len()];
