@@ -77,8 +77,8 @@ fn rate(work: impl Fn() -> f64) -> f64 {
 /// What earlier runs took, by kind of work.
 #[derive(Debug, Clone, Default)]
 pub struct History {
-    /// Seconds that the products alone would have taken, and that it took, by op, and by op and what it works on.
-    by_products: BTreeMap<String, Vec<[f64; 2]>>,
+    /// Seconds of every run, and how many more per second of its products alone, by op, and by op and what it works on.
+    by_products: BTreeMap<String, [f64; 2]>,
     /// Seconds per unit of work, by op and what it works on.
     by_work: BTreeMap<String, Vec<f64>>,
 }
@@ -88,6 +88,8 @@ impl History {
     #[must_use]
     pub fn of(runs: &Path, machine: &Machine) -> Self {
         let mut history = Self::default();
+        // Seconds that the products alone would have taken, and that it took.
+        let mut products: BTreeMap<String, Vec<[f64; 2]>> = BTreeMap::new();
         for run in RunDirectory::all(runs).unwrap_or_default() {
             let Ok(schedule) = Schedule::read(&run) else {
                 continue;
@@ -108,7 +110,7 @@ impl History {
                         work.op.clone(),
                         one_modality(&work.op, work.settings.json()),
                     ] {
-                        let seen = history.by_products.entry(key).or_default();
+                        let seen = products.entry(key).or_default();
                         seen.push([ideal, record.seconds]);
                     }
                 }
@@ -119,6 +121,10 @@ impl History {
                 }
             }
         }
+        let lines = products.into_iter();
+        history.by_products = lines
+            .filter_map(|(key, seen)| Some((key, line(&seen)?)))
+            .collect();
         history
     }
 
@@ -134,9 +140,9 @@ impl History {
     ) -> Option<f64> {
         if let Some(flop) = flop {
             let ideal = flop / machine.products;
-            let seen = self.by_products.get(&one_modality(op, settings));
-            let seen = seen.or_else(|| self.by_products.get(op));
-            let [start, factor] = seen.and_then(|seen| line(seen)).unwrap_or([0.0, USUAL]);
+            let known = self.by_products.get(&one_modality(op, settings));
+            let known = known.or_else(|| self.by_products.get(op));
+            let [start, factor] = known.copied().unwrap_or([0.0, USUAL]);
             return Some(start + factor * ideal);
         }
         let each = median(self.by_work.get(&kind(op, settings))?)?;
@@ -213,7 +219,8 @@ mod tests {
         assert_eq!(of(&history, None, Some(10)), None);
         let of_products = |seen: Vec<[f64; 2]>| {
             let mut history = History::default();
-            history.by_products.insert("train_mget".into(), seen);
+            let line = line(&seen).unwrap();
+            history.by_products.insert("train_mget".into(), line);
             of(&history, Some(2e9), None).unwrap()
         };
         assert!((of_products(vec![[4.0, 20.0]]) - 10.0).abs() < 1e-9);

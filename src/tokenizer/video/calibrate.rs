@@ -38,15 +38,10 @@ impl VideoTokenizer {
         mut read: impl FnMut(usize) -> Result<Option<Signal>, E>,
     ) -> Result<(), E> {
         let mut coefficients = Moments::new(self.settings().coefficients());
-        let mut any = false;
-        for index in 0..count {
-            if let Some(signal) = read(index)? {
-                let clip = self.checked_one(index, &signal)?;
-                any = true;
-                coefficients.add(&to_host(self.coefficients(&[&clip])));
-            }
-        }
-        if !any {
+        let found = self.each_clip(count, &mut read, |clip| {
+            coefficients.add(&to_host(self.coefficients(&[clip])));
+        })?;
+        if found == 0 {
             return Err(TokenizerError::Other("no clips to calibrate on".to_owned()).into());
         }
         self.standardise(coefficients.statistics()?)?;
@@ -58,12 +53,9 @@ impl VideoTokenizer {
         centre(&mut weights);
         self.load(&weights)?;
         let mut latents = Whitening::new(self.settings().levels.len());
-        for index in 0..count {
-            if let Some(signal) = read(index)? {
-                let clip = self.checked_one(index, &signal)?;
-                latents.add(&to_host(self.latents(self.blocks(&[&clip]), 1)));
-            }
-        }
+        self.each_clip(count, &mut read, |clip| {
+            latents.add(&to_host(self.latents(self.blocks(&[clip]), 1)));
+        })?;
         latents.apply(&mut weights, "quant_conv.conv3d", SPREAD)?;
         for name in ["weight", "bias"] {
             let name = format!("decoder.conv_out.1.conv3d.{name}");
@@ -71,6 +63,23 @@ impl VideoTokenizer {
             floats(&mut weights, &name, rows)?.fill(0.0);
         }
         Ok(self.load(&weights)?)
+    }
+
+    /// Calls `visit` with the values of every clip that `read` gives, one after the other; how many there were.
+    fn each_clip<E: From<TokenizerError>>(
+        &self,
+        count: usize,
+        mut read: impl FnMut(usize) -> Result<Option<Signal>, E>,
+        mut visit: impl FnMut(&[f32]),
+    ) -> Result<usize, E> {
+        let mut found = 0;
+        for index in 0..count {
+            if let Some(signal) = read(index)? {
+                visit(&self.checked_one(index, &signal)?);
+                found += 1;
+            }
+        }
+        Ok(found)
     }
 
     fn load(&mut self, weights: &Weights) -> Result<(), TokenizerError> {
