@@ -1,10 +1,9 @@
 //! Torch files that are no archives, as torch wrote them before 1.6 and still does when asked to: five pickles (a magic number,
 //! the version, the machine, the objects, the keys of the storages), then every storage with its number of elements.
 
-use super::memory::identify;
 use super::{Checkpoint, CheckpointError, Source, tree};
 use crate::formats::pickle::{Node, Pickle, Scalar};
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::Path;
@@ -121,18 +120,7 @@ impl Checkpoint {
                 )));
             }
         }
-        let (entries, overlap) = identify(contents.entries, place - end).map_err(refused)?;
-        Ok(Self {
-            path: path.to_owned(),
-            format: contents.format,
-            entries,
-            arguments: contents.arguments,
-            others: contents.others,
-            wrappers: contents.wrappers,
-            opaque: contents.opaque,
-            source: Source::Legacy { file, places },
-            overlap,
-            verified: BTreeSet::new(),
-        })
+        let source = Source::Legacy { file, places };
+        Self::of_pickle(path, contents, place - end, source)
     }
 }

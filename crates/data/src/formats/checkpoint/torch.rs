@@ -1,11 +1,10 @@
 //! Torch archives: a zip with one pickle that describes tensors, and one stored member per storage.
 
-use super::memory::identify;
 use super::{Checkpoint, CheckpointError, Source, tree};
 use crate::formats::FormatError;
 use crate::formats::pickle::Pickle;
 use crate::formats::zip::{Method, ZipArchive};
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::BTreeMap;
 use std::fs::File;
 use std::io::BufReader;
 use std::path::Path;
@@ -45,9 +44,8 @@ impl Checkpoint {
         let pickle = Pickle::parse(&bytes).map_err(|e| refused(e.to_string()))?;
         drop(bytes);
         let contents = tree::contents(&pickle).map_err(refused)?;
-        let entries = contents.entries;
         let mut sizes = BTreeMap::new();
-        for (name, view) in &entries {
+        for (name, view) in &contents.entries {
             let storage = &view.storage;
             let member = zip
                 .find(&format!("{root}/data/{}", storage.key))
@@ -68,21 +66,10 @@ impl Checkpoint {
             }
             sizes.insert(storage.key.clone(), member.size);
         }
-        let (entries, overlap) = identify(entries, sizes.values().sum()).map_err(refused)?;
-        Ok(Self {
-            path: path.to_owned(),
-            format: contents.format,
-            entries,
-            arguments: contents.arguments,
-            others: contents.others,
-            wrappers: contents.wrappers,
-            opaque: contents.opaque,
-            source: Source::Archive {
-                zip: Box::new(zip),
-                root,
-            },
-            overlap,
-            verified: BTreeSet::new(),
-        })
+        let source = Source::Archive {
+            zip: Box::new(zip),
+            root,
+        };
+        Self::of_pickle(path, contents, sizes.values().sum(), source)
     }
 }

@@ -1,11 +1,12 @@
 //! What the objects of a torch pickle describe: the dictionary of tensors, or the tree of a compiled module, and the arguments
 //! beside it.
 
-use super::memory::{MAX_ENTRIES, MAX_NAME};
-use super::{BARE, Format};
+use super::memory::{MAX_ENTRIES, MAX_NAME, identify};
+use super::{BARE, Checkpoint, CheckpointError, Format, Source};
 use crate::formats::pickle::{Global, Id, Node, Pickle, TensorView};
 use serde_json::{Map, Value};
 use std::collections::BTreeSet;
+use std::path::Path;
 
 /// No object tree of a model is deeper.
 const MAX_DEPTH: usize = 64;
@@ -57,6 +58,31 @@ pub(super) struct Contents {
     pub others: Vec<String>,
     /// Keys that lead to the dictionary of the tensors.
     pub wrappers: Vec<String>,
+}
+
+impl Checkpoint {
+    /// A checkpoint of what a torch pickle holds, whose storages have `stored` bytes together.
+    pub(super) fn of_pickle(
+        path: &Path,
+        contents: Contents,
+        stored: u64,
+        source: Source,
+    ) -> Result<Self, CheckpointError> {
+        let (entries, overlap) = identify(contents.entries, stored)
+            .map_err(|reason| CheckpointError::refused(path, reason))?;
+        Ok(Self {
+            path: path.to_owned(),
+            format: contents.format,
+            entries,
+            arguments: contents.arguments,
+            others: contents.others,
+            wrappers: contents.wrappers,
+            opaque: contents.opaque,
+            source,
+            overlap,
+            verified: BTreeSet::new(),
+        })
+    }
 }
 
 /// Reads what a torch pickle describes.
