@@ -6,7 +6,7 @@ use std::arch::x86_64::{
     _mm256_shuffle_ps, _mm256_storeu_ps, _mm256_unpackhi_ps, _mm256_unpacklo_ps,
 };
 
-use super::tile::{Onto, Tile, tile_functions};
+use super::tile::{Onto, SUMS, Strip, Tile, tile_functions};
 use super::{Kernels, tile};
 
 /// Values of a register.
@@ -26,6 +26,8 @@ pub(super) static KERNELS: Kernels = Kernels {
         tile_functions!(tile, 5),
         tile_functions!(tile, 6),
     ],
+    row,
+    outer,
     transpose,
 };
 

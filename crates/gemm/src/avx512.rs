@@ -8,7 +8,7 @@ use std::arch::x86_64::{
     _mm512_unpacklo_ps,
 };
 
-use super::tile::{Onto, Tile, tile_functions};
+use super::tile::{Onto, SUMS, Strip, Tile, tile_functions};
 use super::{Kernels, tile};
 
 /// Values of a register.
@@ -36,6 +36,8 @@ pub(super) static KERNELS: Kernels = Kernels {
         tile_functions!(tile, 13),
         tile_functions!(tile, 14),
     ],
+    row,
+    outer,
     transpose,
 };
 

@@ -5,7 +5,7 @@
 
 use std::cell::RefCell;
 
-use super::tile::{Onto, Tile};
+use super::tile::{Onto, Strip, Tile};
 use super::{Kernels, Operand};
 
 /// Inner length of a block, at most. Sums are rounded where blocks meet, so this is one of the two things that decide the bits of a
@@ -32,6 +32,8 @@ pub(super) struct Product {
     pub c_row: usize,
     pub alpha: f32,
     pub onto: Onto,
+    /// The whole product, of which this may be a share, is one row of `a` by columns of `b` that lie in one piece.
+    pub single_row: bool,
 }
 
 thread_local! {
@@ -65,6 +67,14 @@ impl Product {
     /// The processor has the instructions of `kernels`; the operands can be read and `c` written at all rows and columns, by nobody
     /// else meanwhile; rows of `a` or its columns are neighbours, and so are those of `b`.
     pub unsafe fn run(&self, kernels: &Kernels) {
+        if self.single_row {
+            // SAFETY: by the caller's promise.
+            return unsafe { (kernels.row)(&self.strip()) };
+        }
+        if self.inner == 1 && self.b.column == 1 {
+            // SAFETY: by the caller's promise.
+            return unsafe { (kernels.outer)(&self.strip()) };
+        }
         PACKED.with_borrow_mut(|[a, b]| {
             let block = block_of(self.inner);
             let rows = self.rows.min(ROWS + kernels.rows);
@@ -97,6 +107,22 @@ impl Product {
                 column += columns;
             }
         });
+    }
+
+    fn strip(&self) -> Strip {
+        Strip {
+            rows: self.rows,
+            columns: self.columns,
+            inner: self.inner,
+            a: self.a.start,
+            a_row: self.a.row,
+            b: self.b.start,
+            b_column: self.b.column,
+            c: self.c,
+            c_row: self.c_row,
+            alpha: self.alpha,
+            onto: self.onto,
+        }
     }
 
     /// # Safety

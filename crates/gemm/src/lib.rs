@@ -4,8 +4,9 @@
 //! packing), [`tile`] (the innermost loop) and what it is made of on [`avx512`], [`avx2`] and [`portable`].
 //!
 //! **Same bits.** Each element is a chain of fused multiply-adds over the inner index, in blocks whose length depends on the inner
-//! length alone. So results are the same on any number of threads and on any processor with fused multiply-adds: x86 since 2013
-//! (AVX2 or AVX-512) and 64-bit ARM. Elsewhere products and sums are rounded one after the other.
+//! length alone; where `a` has a single row and the columns of `b` lie in one piece, sixteen such chains are added in a fixed order. So
+//! results are the same on any number of threads and on any processor with fused multiply-adds: x86 since 2013 (AVX2 or AVX-512) and
+//! 64-bit ARM. Elsewhere products and sums are rounded one after the other.
 #![allow(unsafe_code)]
 
 #[cfg(target_arch = "x86_64")]
@@ -21,7 +22,7 @@ use std::sync::OnceLock;
 use rayon::prelude::*;
 
 use blocked::Product;
-use tile::{Onto, TileFunctions};
+use tile::{Onto, StripFunction, TileFunctions};
 
 /// Whether the portable tiles fuse multiplication and addition: the target always has the instruction.
 const PORTABLE_FUSES: bool = cfg!(any(target_arch = "aarch64", target_feature = "fma"));
@@ -39,6 +40,10 @@ struct Kernels {
     lanes: usize,
     /// By rows, from one on.
     tiles: &'static [TileFunctions],
+    /// A single row by columns whose inner indices are neighbours.
+    row: StripFunction,
+    /// A single inner index.
+    outer: StripFunction,
     transpose: unsafe fn(*const f32, usize, usize, usize, *mut f32, usize),
 }
 
@@ -294,6 +299,8 @@ impl<'a> Shared<'a> {
         );
         let (a, b) = (a.operand(), b.operand());
         let onto = SharedOnto(onto);
+        // Of the whole product: the share of a task must not choose other sums.
+        let single_row = rows == 1 && a.column == 1 && b.row == 1 && b.column >= inner;
         let task = move |(row, rows): (usize, usize), (column, columns): (usize, usize)| {
             // Captured whole: the pointers in them may cross threads only as these.
             let (this, onto) = (self, onto);
@@ -306,6 +313,7 @@ impl<'a> Shared<'a> {
                 c: this.start.wrapping_add(start + row * row_stride + column),
                 c_row: row_stride,
                 alpha,
+                single_row,
                 onto: match onto.0 {
                     Onto::Row(values) => Onto::Row(values.wrapping_add(column)),
                     onto => onto,
@@ -370,8 +378,11 @@ mod tests {
     }
 
     /// Shapes around the borders of tiles, panels and blocks.
-    const SHAPES: [[usize; 3]; 12] = [
+    const SHAPES: [[usize; 3]; 15] = [
         [1, 1, 1],
+        [1, 37, 5],
+        [1, 400, 70],
+        [5, 1, 40],
         [3, 0, 5],
         [7, 500, 64],
         [14, 16, 32],
@@ -494,6 +505,9 @@ mod tests {
             (64, 64, 1),
             (257, 129, 65),
             (64, 1000, 1030),
+            // Of one row, and with a share of one row.
+            (1, 3000, 700),
+            (43, 2000, 64),
         ] {
             let (a, b) = (waves(m * k, 0.37), waves(k * n, 0.11));
             let product = |threads: usize, transposed: bool| {

@@ -3,7 +3,7 @@
 // Vector instructions reach only what is inlined.
 #![allow(clippy::inline_always)]
 
-use super::tile::{Onto, Tile, tile_functions};
+use super::tile::{Onto, SUMS, Strip, Tile, tile_functions};
 use super::{Kernels, tile};
 
 /// Values that are computed together.
@@ -23,6 +23,8 @@ pub(super) static KERNELS: Kernels = Kernels {
         tile_functions!(tile, 5),
         tile_functions!(tile, 6),
     ],
+    row,
+    outer,
     transpose,
 };
 
