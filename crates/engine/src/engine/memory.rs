@@ -1,4 +1,4 @@
-//! An allocator that keeps large blocks for the next one of the same size, for programs that compute step by step.
+//! An allocator that keeps large blocks for the next step, for programs that compute step by step.
 //!
 //! A training step allocates the same arrays again and again. Given back to the system, each comes as fresh pages, which the kernel
 //! clears one fault at a time. A program that says
@@ -9,45 +9,46 @@
 //! # fn main() {}
 //! ```
 //!
-//! keeps them instead: what is in use and what is kept are together at most an eighth more than what was in use at once since the last
-//! [`release`]. On Linux, blocks of 2 MiB and more ask for huge pages. Small blocks go to the system's allocator as ever.
+//! takes large blocks from one piece of address space, in huge pages where the system has them. What is freed there stays with the
+//! program until [`release`]; neighbours are joined, so it serves blocks of any size. Small blocks go to the system's allocator as
+//! ever, and so do all where there is no such piece: off Linux, or under a limit of address space.
 #![allow(unsafe_code)]
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::UnsafeCell;
-use std::ptr::null_mut;
+use std::ptr::{NonNull, null_mut};
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// Blocks of this size and more are kept.
-const FROM: usize = 64 * 1024;
-/// Blocks of this size and more are mapped, in huge pages where the system has them.
+use talc::base::Talc;
+use talc::base::binning::Binning;
+use talc::base::bitfield::TwoLevelBitField;
+use talc::source::Manual;
+
+/// Blocks of this size and more come from the arena.
+const FROM: usize = 1 << FROM_BITS;
+const FROM_BITS: u32 = 16;
+/// A huge page.
 const HUGE: usize = 2 * 1024 * 1024;
-/// Sizes per doubling: a block is at most an eighth larger than asked for.
-const STEPS: usize = 8;
-/// Doublings from [`FROM`] on; what is larger is not kept.
-const DOUBLINGS: usize = 24;
-/// Alignments that blocks have.
-const ALIGN: usize = 64;
+/// Sizes per doubling: a block is at most a sixty-fourth larger than asked for.
+const STEPS: usize = 1 << STEP_BITS;
+const STEP_BITS: u32 = 6;
+/// A cache line.
+const LINE: usize = 64;
+/// What the arena writes behind each block.
+const TAG: usize = 8;
 
 /// The allocator.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Pool;
 
-/// Gives all blocks that are kept back to the system, and what the system's allocator keeps of small ones: for the end of a stage. Gives
-/// how many bytes of blocks that were.
-pub fn release() -> usize {
-    let (first, bytes) = SHARED.with(|state| {
-        state.most = state.used;
-        state.take_beyond(0)
-    });
-    // SAFETY: the blocks were taken out of the lists, so nobody else has them.
-    unsafe { free_all(first) };
+/// Gives all memory that nobody uses back to the system, and what the system's allocator keeps of small blocks: for the end of a stage.
+pub fn release() {
+    ARENA.with(Arena::discard);
     #[cfg(all(target_os = "linux", target_env = "gnu"))]
     // SAFETY: it may be called at any time, from any thread.
     unsafe {
         libc::malloc_trim(0);
     }
-    bytes
 }
 
 /// Calls [`release`] when it is dropped: the first thing in a stage, so that it goes after all that the stage made.
@@ -60,69 +61,153 @@ impl Drop for Stage {
     }
 }
 
-/// A block that nobody uses; the links lie in the blocks themselves.
-struct Free {
-    next: *mut Free,
-    size: usize,
+/// Free pieces by size. A block is as large as the smallest piece of its bin, so that a freed one serves the next of its size.
+struct Bins;
+
+impl Binning for Bins {
+    type AvailabilityBitField = TwoLevelBitField<u64, u64, 25>;
+
+    fn size_to_bin(size: usize) -> u32 {
+        if size < FROM {
+            return 0;
+        }
+        let doubling = size.ilog2();
+        let step = (size >> (doubling - STEP_BITS)) as u32 % STEPS as u32;
+        1 + (doubling - FROM_BITS) * STEPS as u32 + step
+    }
 }
 
-struct State {
-    free: [*mut Free; STEPS * DOUBLINGS],
-    /// Bytes in use, as blocks.
-    used: usize,
-    /// Bytes kept.
-    kept: usize,
-    /// The most that was in use since the last release.
-    most: usize,
+/// The block in the arena that serves `layout`; `None` if the system's allocator does.
+fn block(layout: Layout) -> Option<Layout> {
+    if layout.size() < FROM {
+        return None;
+    }
+    let piece = layout.size().checked_add(TAG)?;
+    let step = 1 << (piece.ilog2() - STEP_BITS);
+    let size = piece.checked_next_multiple_of(step)? - TAG;
+    Layout::from_size_align(size, layout.align()).ok()
 }
 
-impl State {
-    /// Takes blocks out, the largest first, until at most `keep` bytes stay: a list, and its bytes.
-    fn take_beyond(&mut self, keep: usize) -> (*mut Free, usize) {
-        let (mut list, mut bytes) = (null_mut(), 0);
-        for first in self.free.iter_mut().rev() {
-            while self.kept > keep && !first.is_null() {
-                let block = *first;
-                // SAFETY: blocks in the lists are valid, and only reached under the lock.
-                unsafe {
-                    *first = (*block).next;
-                    (*block).next = list;
-                    self.kept -= (*block).size;
-                    bytes += (*block).size;
-                }
-                list = block;
+struct Arena {
+    /// The address space was asked for: once, by the first block.
+    opened: bool,
+    start: *mut u8,
+    /// Up to here the blocks go; beyond it is address space alone.
+    heap: Option<NonNull<u8>>,
+    end: *mut u8,
+    blocks: Talc<Manual, Bins>,
+}
+
+/// What is written into a free piece at each end, at most.
+const HEAD: usize = 64;
+/// The heap grows by this and its multiples.
+const GROWTH: usize = 16 * HUGE;
+/// Free pieces that are discarded at once, at most.
+const PIECES: usize = 512;
+
+impl Arena {
+    const EMPTY: Self = Self {
+        opened: false,
+        start: null_mut(),
+        heap: None,
+        end: null_mut(),
+        blocks: Talc::new(Manual),
+    };
+
+    fn open(&mut self) {
+        self.opened = true;
+        let Some((start, size)) = pages::reserve() else {
+            return;
+        };
+        // SAFETY: the pages are new, and nobody else's.
+        self.heap = unsafe { self.blocks.claim(start, GROWTH) };
+        self.start = start;
+        self.end = start.wrapping_add(size);
+        // Blocks are multiples of a cache line. If the first does not begin with one, none would: half a line is given away.
+        let spacer = Layout::new::<u8>();
+        // SAFETY: the size is not zero; what is given back was allocated with this layout.
+        unsafe {
+            if let Some(first) = self.blocks.try_allocate(spacer)
+                && first.addr().get().is_multiple_of(LINE)
+            {
+                self.blocks.deallocate(first.as_ptr(), spacer);
             }
         }
-        (list, bytes)
     }
 
-    /// How much may be kept beside what is in use.
-    fn room(&self) -> usize {
-        (self.most + self.most / 8).saturating_sub(self.used)
+    fn holds(&self, block: *mut u8) -> bool {
+        (self.start..self.end).contains(&block)
+    }
+
+    /// `None` if there is no room.
+    fn take(&mut self, block: Layout) -> Option<NonNull<u8>> {
+        if !self.opened {
+            self.open();
+        }
+        let heap = self.heap?;
+        // SAFETY: the size is not zero; the heap ends where it was said to end, and grows in what was reserved for it.
+        unsafe {
+            if let Some(start) = self.blocks.try_allocate(block) {
+                return Some(start);
+            }
+            let more = block.size().checked_add(HUGE)?.next_multiple_of(GROWTH);
+            if more > self.end.addr() - heap.addr().get() {
+                return None;
+            }
+            let end = heap.as_ptr().wrapping_add(more);
+            self.heap = Some(self.blocks.extend(heap, end));
+            self.blocks.try_allocate(block)
+        }
+    }
+
+    /// Gives the pages of free pieces back to the system, the largest first.
+    fn discard(&mut self) {
+        let Some(heap) = self.heap else {
+            return;
+        };
+        let mut pieces = [(null_mut::<u8>(), Layout::new::<u8>()); PIECES];
+        let mut count = 0;
+        let mut size = (heap.addr().get() - self.start.addr()).next_power_of_two();
+        while size >= HUGE && count < PIECES {
+            let Ok(layout) = Layout::from_size_align(size - TAG, 1) else {
+                break;
+            };
+            // SAFETY: the size is not zero.
+            match unsafe { self.blocks.try_allocate(layout) } {
+                Some(start) => {
+                    pieces[count] = (start.as_ptr(), layout);
+                    count += 1;
+                }
+                None => size /= 2,
+            }
+        }
+        for (start, layout) in &pieces[..count] {
+            // SAFETY: each was allocated above with this layout. What is written into free pieces lies at their ends, and so at
+            // those of what was taken out of them.
+            unsafe {
+                self.blocks.deallocate(*start, *layout);
+                pages::discard(start.add(HEAD), layout.size() - 2 * HEAD);
+            }
+        }
     }
 }
 
-/// The state behind a lock that never allocates and is held for a few instructions.
+/// The arena behind a lock that never allocates; it is held for a few instructions, but where pages are discarded.
 struct Shared {
     taken: AtomicBool,
-    state: UnsafeCell<State>,
+    arena: UnsafeCell<Arena>,
 }
 
-// SAFETY: the state is only reached while `taken` is ours.
+// SAFETY: the arena is only reached while `taken` is ours.
 unsafe impl Sync for Shared {}
 
-static SHARED: Shared = Shared {
+static ARENA: Shared = Shared {
     taken: AtomicBool::new(false),
-    state: UnsafeCell::new(State {
-        free: [null_mut(); STEPS * DOUBLINGS],
-        used: 0,
-        kept: 0,
-        most: 0,
-    }),
+    arena: UnsafeCell::new(Arena::EMPTY),
 };
 
 impl Shared {
-    fn with<R>(&self, run: impl FnOnce(&mut State) -> R) -> R {
+    fn with<R>(&self, run: impl FnOnce(&mut Arena) -> R) -> R {
         while self
             .taken
             .compare_exchange_weak(false, true, Ordering::Acquire, Ordering::Relaxed)
@@ -131,263 +216,274 @@ impl Shared {
             std::hint::spin_loop();
         }
         // SAFETY: the lock is ours; what runs under it neither panics nor allocates.
-        let result = run(unsafe { &mut *self.state.get() });
+        let result = run(unsafe { &mut *self.arena.get() });
         self.taken.store(false, Ordering::Release);
         result
     }
 }
 
-/// The list and the size of blocks that serve `layout`; `None` if it is not kept.
-fn class(layout: Layout) -> Option<(usize, usize)> {
-    if layout.size() < FROM || layout.align() > ALIGN {
-        return None;
-    }
-    // Sizes above 2^n, up to 2^(n + 1), in eight steps.
-    let below = (layout.size() - 1).ilog2() as usize;
-    let step = (1 << below) / STEPS;
-    let size = layout.size().next_multiple_of(step);
-    let index = (below + 1 - FROM.ilog2() as usize) * STEPS + (size - (1 << below)) / step;
-    (index < STEPS * DOUBLINGS).then_some((index, size))
+fn in_arena(layout: Layout) -> Option<NonNull<u8>> {
+    let block = block(layout)?;
+    ARENA.with(|arena| arena.take(block))
 }
 
-fn block_layout(size: usize) -> Option<Layout> {
-    Layout::from_size_align(size, ALIGN).ok()
-}
-
-/// A new block, and whether it is known to be zeros.
-fn fresh(size: usize) -> (*mut u8, bool) {
-    #[cfg(target_os = "linux")]
-    if size >= HUGE {
-        return (mapped::map(size), true);
-    }
-    let Some(layout) = block_layout(size) else {
-        return (null_mut(), false);
-    };
-    // SAFETY: the size is not zero.
-    (unsafe { System.alloc(layout) }, false)
-}
-
-/// # Safety
-/// `block` came from [`fresh`] with this size, and nobody uses it any more.
-unsafe fn free(block: *mut u8, size: usize) {
-    #[cfg(target_os = "linux")]
-    if size >= HUGE {
-        // SAFETY: blocks of this size were mapped.
-        unsafe { mapped::unmap(block, size) };
-        return;
-    }
-    if let Some(layout) = block_layout(size) {
-        // SAFETY: it was allocated with this layout.
-        unsafe { System.dealloc(block, layout) };
-    }
-}
-
-/// # Safety
-/// The blocks of the list are nobody else's.
-unsafe fn free_all(mut list: *mut Free) {
-    while !list.is_null() {
-        // SAFETY: a block of the list carries its link and its size.
-        unsafe {
-            let (next, size) = ((*list).next, (*list).size);
-            free(list.cast(), size);
-            list = next;
-        }
-    }
-}
-
-/// A block of the class, and whether it is known to be zeros.
-fn take(index: usize, size: usize) -> (*mut u8, bool) {
-    let (found, surplus) = SHARED.with(|state| {
-        state.used += size;
-        state.most = state.most.max(state.used);
-        let found = state.free[index];
-        if !found.is_null() {
-            // SAFETY: blocks in the lists are valid.
-            state.free[index] = unsafe { (*found).next };
-            state.kept -= size;
-        }
-        let room = state.room();
-        (found, state.take_beyond(room).0)
-    });
-    // SAFETY: the surplus was taken out of the lists.
-    unsafe { free_all(surplus) };
-    if !found.is_null() {
-        return (found.cast(), false);
-    }
-    let (block, zeros) = fresh(size);
-    if block.is_null() {
-        SHARED.with(|state| state.used -= size);
-    }
-    (block, zeros)
-}
-
-// SAFETY: blocks come from the system, or were given back to us, are as large and as aligned as their class, and go back by the same
-// class; all else is the system's.
+// SAFETY: a block comes from the arena or from the system's allocator, and goes back to where it came from: its address says which.
 unsafe impl GlobalAlloc for Pool {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        match class(layout) {
-            Some((index, size)) => take(index, size).0,
+        match in_arena(layout) {
+            Some(start) => start.as_ptr(),
             // SAFETY: as the caller promises.
             None => unsafe { System.alloc(layout) },
         }
     }
 
     unsafe fn alloc_zeroed(&self, layout: Layout) -> *mut u8 {
-        let Some((index, size)) = class(layout) else {
-            // SAFETY: as the caller promises.
-            return unsafe { System.alloc_zeroed(layout) };
-        };
-        let (block, zeros) = take(index, size);
-        if !zeros && !block.is_null() {
-            // SAFETY: the block is at least as large.
-            unsafe { block.write_bytes(0, layout.size()) };
-        }
-        block
-    }
-
-    unsafe fn dealloc(&self, block: *mut u8, layout: Layout) {
-        let Some((index, size)) = class(layout) else {
-            // SAFETY: as the caller promises.
-            return unsafe { System.dealloc(block, layout) };
-        };
-        let surplus = SHARED.with(|state| {
-            state.used -= size;
-            if size > state.room().saturating_sub(state.kept) {
-                return true;
+        match in_arena(layout) {
+            Some(start) => {
+                // SAFETY: the block is at least as large as the layout.
+                unsafe { start.write_bytes(0, layout.size()) };
+                start.as_ptr()
             }
-            let free: *mut Free = block.cast();
-            let next = state.free[index];
-            // SAFETY: the block is ours again, aligned, and has the room.
-            unsafe { free.write(Free { next, size }) };
-            state.free[index] = free;
-            state.kept += size;
-            false
-        });
-        if surplus {
-            // SAFETY: it came from `fresh` with the size of its class.
-            unsafe { free(block, size) };
+            // SAFETY: as the caller promises.
+            None => unsafe { System.alloc_zeroed(layout) },
         }
     }
 
-    unsafe fn realloc(&self, block: *mut u8, layout: Layout, new_size: usize) -> *mut u8 {
+    unsafe fn dealloc(&self, start: *mut u8, layout: Layout) {
+        let Some(block) = block(layout) else {
+            // SAFETY: as the caller promises.
+            return unsafe { System.dealloc(start, layout) };
+        };
+        let held = ARENA.with(|arena| {
+            let held = arena.holds(start);
+            if held {
+                // SAFETY: it was allocated there with this layout.
+                unsafe { arena.blocks.deallocate(start, block) };
+            }
+            held
+        });
+        if !held {
+            // SAFETY: as the caller promises.
+            unsafe { System.dealloc(start, layout) }
+        }
+    }
+
+    unsafe fn realloc(&self, start: *mut u8, layout: Layout, new_size: usize) -> *mut u8 {
         // SAFETY: the caller promises that the size is valid for the alignment.
         let new = unsafe { Layout::from_size_align_unchecked(new_size, layout.align()) };
-        match (class(layout), class(new)) {
+        match (block(layout), block(new)) {
             // SAFETY: as the caller promises; both are the system's.
-            (None, None) => unsafe { System.realloc(block, layout, new_size) },
-            (Some(old), Some(new)) if old == new => block,
-            _ => {
-                // SAFETY: as the caller promises; the blocks are different.
-                unsafe {
-                    let moved = self.alloc(new);
-                    if !moved.is_null() {
-                        let length = layout.size().min(new_size);
-                        std::ptr::copy_nonoverlapping(block, moved, length);
-                        self.dealloc(block, layout);
-                    }
-                    moved
+            (None, None) => return unsafe { System.realloc(start, layout, new_size) },
+            (Some(old), Some(new)) => {
+                let in_place = ARENA.with(|arena| {
+                    // SAFETY: it was allocated there with the old layout.
+                    arena.holds(start)
+                        && unsafe { arena.blocks.try_realloc_in_place(start, old, new.size()) }
+                });
+                if in_place {
+                    return start;
                 }
             }
+            _ => {}
+        }
+        // SAFETY: as the caller promises; the blocks are different.
+        unsafe {
+            let moved = self.alloc(new);
+            if !moved.is_null() {
+                std::ptr::copy_nonoverlapping(start, moved, layout.size().min(new_size));
+                self.dealloc(start, layout);
+            }
+            moved
         }
     }
 }
 
 #[cfg(target_os = "linux")]
-mod mapped {
-    //! Blocks straight from the kernel, aligned to huge pages.
+mod pages {
+    //! Pages straight from the kernel.
 
-    use super::HUGE;
+    use super::{GROWTH, HUGE};
     use std::ptr::null_mut;
 
-    /// `size` bytes of zeros, in huge pages as far as the system has them; null if there is no memory.
-    pub fn map(size: usize) -> *mut u8 {
-        let Some(length) = size.checked_add(HUGE) else {
-            return null_mut();
-        };
-        // SAFETY: a new private mapping touches nothing that is there; what is cut off lies in it and is nobody's.
+    /// The largest page of any system, but for huge ones.
+    const PAGE: usize = 64 * 1024;
+
+    /// Address space for twice the memory of this machine, and its size; none where address space is limited or memory is promised
+    /// strictly. Pages come when they are written.
+    pub fn reserve() -> Option<(*mut u8, usize)> {
+        // SAFETY: the calls only ask; a new private mapping touches nothing that is there.
         unsafe {
+            let mut limit = std::mem::zeroed::<libc::rlimit>();
+            if libc::getrlimit(libc::RLIMIT_AS, &raw mut limit) != 0
+                || limit.rlim_cur != libc::RLIM_INFINITY
+            {
+                return None;
+            }
+            let pages = usize::try_from(libc::sysconf(libc::_SC_PHYS_PAGES)).ok()?;
+            let page = usize::try_from(libc::sysconf(libc::_SC_PAGESIZE)).ok()?;
+            let size = (2 * pages * page).next_multiple_of(GROWTH);
             let start = libc::mmap(
                 null_mut(),
-                length,
+                size + HUGE,
                 libc::PROT_READ | libc::PROT_WRITE,
-                libc::MAP_PRIVATE | libc::MAP_ANONYMOUS,
+                libc::MAP_PRIVATE | libc::MAP_ANONYMOUS | libc::MAP_NORESERVE,
                 -1,
                 0,
             );
             if start == libc::MAP_FAILED {
-                return null_mut();
+                return None;
             }
             let start: *mut u8 = start.cast();
-            let before = start.align_offset(HUGE);
-            let block = start.add(before);
-            let end = before + rounded(size);
-            if before > 0 {
-                libc::munmap(start.cast(), before);
-            }
-            if end < length {
-                libc::munmap(start.add(end).cast(), length - end);
-            }
+            let start = start.add(start.align_offset(HUGE));
             // Advice: whether it is taken changes nothing but speed.
-            libc::madvise(block.cast(), size, libc::MADV_HUGEPAGE);
-            block
+            libc::madvise(start.cast(), size, libc::MADV_HUGEPAGE);
+            Some((start, size))
         }
     }
 
     /// # Safety
-    /// `block` came from [`map`] with this size, and nobody uses it any more.
-    pub unsafe fn unmap(block: *mut u8, size: usize) {
-        // SAFETY: exactly what was mapped.
-        unsafe { libc::munmap(block.cast(), rounded(size)) };
+    /// Nobody needs what is in these bytes.
+    pub unsafe fn discard(start: *mut u8, size: usize) {
+        let before = start.align_offset(PAGE);
+        let whole = size.saturating_sub(before) / PAGE * PAGE;
+        // SAFETY: only whole pages of these bytes.
+        unsafe { libc::madvise(start.add(before).cast(), whole, libc::MADV_DONTNEED) };
+    }
+}
+
+#[cfg(not(target_os = "linux"))]
+mod pages {
+    pub fn reserve() -> Option<(*mut u8, usize)> {
+        None
     }
 
-    /// In whole pages, of any size that systems have.
-    fn rounded(size: usize) -> usize {
-        size.next_multiple_of(64 * 1024)
-    }
+    /// # Safety
+    /// Nobody needs what is in these bytes.
+    pub unsafe fn discard(_: *mut u8, _: usize) {}
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::sync::Mutex;
+
+    /// The pool is one for the whole program.
+    static ALONE: Mutex<()> = Mutex::new(());
 
     fn layout(size: usize) -> Layout {
-        Layout::from_size_align(size, 16).unwrap()
+        Layout::from_size_align(size, 64).unwrap()
     }
 
     #[test]
-    fn a_block_is_at_most_an_eighth_larger_and_classes_do_not_overlap() {
-        assert_eq!(class(layout(FROM - 1)), None);
-        let (mut last, mut size) = ((0, 0), FROM);
-        while size < 1 << 34 {
-            let (index, block) = class(layout(size)).unwrap();
-            assert!(block >= size && block - size <= size / 8, "{size}: {block}");
-            assert!(block == last.1 || index > last.0, "{size}");
-            last = (index, block);
+    fn a_block_is_at_most_a_sixty_fourth_larger_and_fills_the_smallest_piece_of_its_bin() {
+        assert_eq!(block(layout(FROM - 1)), None);
+        let mut size = FROM;
+        while size < 1 << 40 {
+            let piece = block(layout(size)).unwrap().size() + TAG;
+            assert!(piece > size && piece - size <= size / STEPS + TAG, "{size}");
+            let bin = Bins::size_to_bin(piece);
+            assert_eq!(Bins::size_to_bin(piece - 1) + 1, bin, "{size}");
+            assert!(bin < Bins::BIN_COUNT, "{size}");
             size += size / 97 + 1;
         }
-        assert_eq!(class(layout(1 << 50)), None);
-        assert_eq!(class(Layout::from_size_align(FROM, 4096).unwrap()), None);
     }
 
-    /// One test, because the pool is one for the whole program.
     #[test]
-    fn a_block_comes_again_cleared_where_zeros_are_asked_for_and_goes_back_on_release() {
-        for size in [FROM + 1, 5 * HUGE] {
-            // SAFETY: the blocks are used within their layouts, and given back once.
-            unsafe {
-                let block = Pool.alloc(layout(size));
-                block.write_bytes(7, size);
-                Pool.dealloc(block, layout(size));
-                let again = Pool.alloc_zeroed(layout(size));
-                assert_eq!(again, block);
-                assert!((0..size).all(|i| *again.add(i) == 0));
-                again.add(size - 1).write(9);
-                let grown = Pool.realloc(again, layout(size), 2 * size);
-                assert_eq!((*grown.add(size - 1), *grown.add(1)), (9, 0));
-                Pool.dealloc(grown, layout(2 * size));
-                assert!(release() > 0);
-                assert_eq!(release(), 0);
+    fn blocks_do_not_overlap_keep_what_is_in_them_and_are_cleared_where_zeros_are_asked_for() {
+        let _alone = ALONE.lock();
+        let mut state = 1_u64;
+        // The high bits of a linear congruential generator.
+        let mut random = |below: usize| {
+            state = state
+                .wrapping_mul(6_364_136_223_846_793_005)
+                .wrapping_add(1);
+            (state >> 33) as usize % below
+        };
+        let mut blocks: Vec<(*mut u8, Layout, u8)> = Vec::new();
+        // SAFETY: each block is used within its layout, and given back once.
+        unsafe {
+            let ends =
+                |start: *mut u8, size: usize| [start, start.add(size / 2), start.add(size - 1)];
+            for turn in 0..4000 {
+                let most = 1 << (10 + random(14));
+                let size = FROM / 2 + random(most);
+                let label = turn as u8;
+                match random(4) {
+                    0 | 1 => {
+                        let zeros = random(2) == 0;
+                        let start = if zeros {
+                            Pool.alloc_zeroed(layout(size))
+                        } else {
+                            Pool.alloc(layout(size))
+                        };
+                        assert_eq!(start.addr() % 64, 0);
+                        for place in ends(start, size) {
+                            assert!(!zeros || *place == 0);
+                            place.write(label);
+                        }
+                        blocks.push((start, layout(size), label));
+                    }
+                    kind if !blocks.is_empty() => {
+                        let index = random(blocks.len());
+                        let (start, old, label) = blocks.swap_remove(index);
+                        let found = ends(start, old.size()).map(|place| *place);
+                        assert_eq!(found, [label; 3]);
+                        if kind == 2 {
+                            Pool.dealloc(start, old);
+                        } else {
+                            let start = Pool.realloc(start, old, size);
+                            assert_eq!(*start, label);
+                            for place in ends(start, size) {
+                                place.write(label);
+                            }
+                            blocks.push((start, layout(size), label));
+                        }
+                    }
+                    _ => {}
+                }
+                if turn % 1000 == 999 {
+                    release();
+                }
             }
+            for (start, layout, label) in blocks {
+                assert_eq!(*start.add(layout.size() - 1), label);
+                Pool.dealloc(start, layout);
+            }
+        }
+    }
+
+    /// How many of these bytes lie in memory.
+    #[cfg(all(target_os = "linux", target_arch = "x86_64"))]
+    fn resident(start: *mut u8, size: usize) -> usize {
+        const PAGE: usize = 4096;
+        let start = start.wrapping_sub(start.addr() % PAGE);
+        let mut pages = vec![0_u8; size.div_ceil(PAGE)];
+        // SAFETY: it only asks; a byte comes back for each page.
+        let done = unsafe { libc::mincore(start.cast(), size, pages.as_mut_ptr()) };
+        assert_eq!(done, 0, "pages are 4 KiB, and mapped");
+        pages.iter().filter(|page| **page & 1 != 0).count() * PAGE
+    }
+
+    #[test]
+    #[cfg(all(target_os = "linux", target_arch = "x86_64"))]
+    fn what_is_freed_serves_the_next_and_goes_back_on_release() {
+        let _alone = ALONE.lock();
+        let size = 64 * HUGE;
+        // SAFETY: the blocks are used within their layouts, and given back once.
+        unsafe {
+            let start = Pool.alloc(layout(size));
+            start.write_bytes(7, size);
+            Pool.dealloc(start, layout(size));
+            assert_eq!(resident(start, size), size);
+            // Two of half the size lie where the one lay.
+            let half = layout(size / 2 - FROM);
+            let halves = [Pool.alloc(half), Pool.alloc(half)];
+            for place in halves {
+                assert!((start..start.add(size)).contains(&place));
+                Pool.dealloc(place, half);
+            }
+            release();
+            assert!(resident(start, size) < HUGE);
         }
     }
 }
