@@ -58,7 +58,10 @@ fn planes_are_converted_as_ffmpeg_converts_them() {
     let mut checked = 0;
     for (name, arguments) in [
         ("plain.mkv", "-pix_fmt yuv420p -c:v ffv1"),
-        ("odd.mkv", "-vf scale=85:49,setsar=1 -pix_fmt yuv420p -c:v ffv1"),
+        (
+            "odd.mkv",
+            "-vf scale=85:49,setsar=1 -pix_fmt yuv420p -c:v ffv1",
+        ),
         (
             "odd_height.mkv",
             "-vf scale=86:49,setsar=1 -pix_fmt yuv420p -c:v ffv1",
