@@ -5,6 +5,9 @@
 //! down, every chroma sample serving its 2 x 2 block. The matrix is the one that the stream names, else the container; where neither does it is
 //! BT.601 with limited range at every resolution, as they do.
 
+#[cfg(target_arch = "x86_64")]
+mod x86;
+
 use crate::video::image::Image;
 use rusty_h264_common::YuvFrame;
 
@@ -62,49 +65,150 @@ impl Matrix {
 }
 
 /// From 16 to 13 bits of fraction, rounded.
-fn thirteen(value: i64) -> i32 {
-    (((value << 13) + (1 << 15)) >> 16) as i32
+fn thirteen(value: i64) -> i16 {
+    (((value << 13) + (1 << 15)) >> 16) as i16
+}
+
+/// Factors with 13 bits of fraction; samples come with three, and 16 are dropped from each product.
+#[derive(Clone, Copy)]
+struct Factors {
+    v_red: i16,
+    u_blue: i16,
+    u_green: i16,
+    v_green: i16,
+    luma: i16,
+    luma_offset: i16,
+}
+
+impl Factors {
+    fn of(space: ColourSpace) -> Self {
+        let [v_red, u_blue, u_green, v_green] = space.matrix.coefficients().map(|value| {
+            thirteen(if space.full_range {
+                value * 224 / 255
+            } else {
+                value
+            })
+        });
+        let (luma, luma_offset) = if space.full_range {
+            (thirteen(1 << 16), 0)
+        } else {
+            (thirteen((255 << 16) / 219), 16)
+        };
+        Factors {
+            v_red,
+            u_blue,
+            u_green,
+            v_green,
+            luma,
+            luma_offset,
+        }
+    }
+
+    /// What a chroma sample adds to red, green and blue.
+    fn chroma(self, u: u8, v: u8) -> [i16; 3] {
+        let (u, v) = (8 * (i16::from(u) - 128), 8 * (i16::from(v) - 128));
+        [
+            high(v, self.v_red),
+            high(u, self.u_green) + high(v, self.v_green),
+            high(u, self.u_blue),
+        ]
+    }
+
+    fn luma(self, y: u8) -> i16 {
+        high(8 * (i16::from(y) - self.luma_offset), self.luma)
+    }
+}
+
+/// The upper half of the product.
+fn high(a: i16, b: i16) -> i16 {
+    ((i32::from(a) * i32::from(b)) >> 16) as i16
+}
+
+/// The planes of a 4:2:0 picture: of chroma half the columns and rows, rounded up.
+#[derive(Debug, Clone, Copy)]
+pub struct Planes<'a> {
+    /// Pixels.
+    pub width: usize,
+    /// Pixels.
+    pub height: usize,
+    /// Luma.
+    pub y: &'a [u8],
+    /// Blue chroma.
+    pub u: &'a [u8],
+    /// Red chroma.
+    pub v: &'a [u8],
+}
+
+impl<'a> Planes<'a> {
+    /// Bytes of all three.
+    #[must_use]
+    pub fn bytes(width: usize, height: usize) -> usize {
+        width * height + 2 * width.div_ceil(2) * height.div_ceil(2)
+    }
+
+    /// One behind the other; `data` has as many bytes as [`Planes::bytes`] says.
+    #[must_use]
+    pub fn packed(width: usize, height: usize, data: &'a [u8]) -> Self {
+        let (y, chroma) = data.split_at(width * height);
+        let (u, v) = chroma.split_at(width.div_ceil(2) * height.div_ceil(2));
+        Planes {
+            width,
+            height,
+            y,
+            u,
+            v,
+        }
+    }
+
+    /// RGB.
+    #[must_use]
+    pub fn to_rgb(self, space: ColourSpace) -> Image {
+        let factors = Factors::of(space);
+        let (width, half) = (self.width, self.width.div_ceil(2));
+        let mut data = Vec::with_capacity(width * self.height * 3);
+        let mut line = vec![0; width * 3];
+        for row in 0..self.height {
+            let y = &self.y[row * width..][..width];
+            let u = &self.u[row / 2 * half..][..half];
+            let v = &self.v[row / 2 * half..][..half];
+            line_to_rgb(&mut line, y, u, v, factors);
+            data.extend_from_slice(&line);
+        }
+        Image {
+            width: width as u32,
+            height: self.height as u32,
+            data,
+        }
+    }
 }
 
 /// RGB of one 4:2:0 picture.
 #[must_use]
 pub fn to_rgb(picture: &YuvFrame, space: ColourSpace) -> Image {
-    let [v_red, u_blue, u_green, v_green] = space.matrix.coefficients().map(|value| {
-        thirteen(if space.full_range {
-            value * 224 / 255
-        } else {
-            value
-        })
-    });
-    let (luma, luma_offset) = if space.full_range {
-        (thirteen(1 << 16), 0)
-    } else {
-        (thirteen((255 << 16) / 219), 16)
+    let planes = Planes {
+        width: picture.width,
+        height: picture.height,
+        y: &picture.y,
+        u: &picture.u,
+        v: &picture.v,
     };
-    let (width, height) = (picture.width, picture.height);
-    let chroma_width = width.div_ceil(2);
-    let mut data = vec![0_u8; width * height * 3];
-    for (row, out) in data.chunks_exact_mut(width * 3).enumerate() {
-        let y_row = &picture.y[row * width..][..width];
-        let u_row = &picture.u[row / 2 * chroma_width..][..chroma_width];
-        let v_row = &picture.v[row / 2 * chroma_width..][..chroma_width];
-        for (((out, y), u), v) in out.chunks_mut(6).zip(y_row.chunks(2)).zip(u_row).zip(v_row) {
-            let (u, v) = (8 * (i32::from(*u) - 128), 8 * (i32::from(*v) - 128));
-            let add_red = (v * v_red) >> 16;
-            let add_green = ((u * u_green) >> 16) + ((v * v_green) >> 16);
-            let add_blue = (u * u_blue) >> 16;
-            for (pixel, y) in out.chunks_exact_mut(3).zip(y) {
-                let y = (8 * (i32::from(*y) - luma_offset) * luma) >> 16;
-                pixel[0] = (y + add_red).clamp(0, 255) as u8;
-                pixel[1] = (y + add_green).clamp(0, 255) as u8;
-                pixel[2] = (y + add_blue).clamp(0, 255) as u8;
+    planes.to_rgb(space)
+}
+
+fn line_to_rgb(out: &mut [u8], y: &[u8], u: &[u8], v: &[u8], factors: Factors) {
+    #[cfg(target_arch = "x86_64")]
+    let done = x86::blocks_to_rgb(out, y, u, v, factors);
+    #[cfg(not(target_arch = "x86_64"))]
+    let done = 0;
+    let pixels = out[3 * done..].chunks_mut(6).zip(y[done..].chunks(2));
+    for (((out, y), u), v) in pixels.zip(&u[done / 2..]).zip(&v[done / 2..]) {
+        let add = factors.chroma(*u, *v);
+        for (pixel, y) in out.chunks_exact_mut(3).zip(y) {
+            let y = factors.luma(*y);
+            for (value, add) in pixel.iter_mut().zip(add) {
+                *value = (y + add).clamp(0, 255) as u8;
             }
         }
-    }
-    Image {
-        width: width as u32,
-        height: height as u32,
-        data,
     }
 }
 
@@ -121,6 +225,41 @@ mod tests {
             v: vec![v],
         };
         to_rgb(&picture, space).data[..3].try_into().unwrap()
+    }
+
+    /// The same in the widest integers, pixel by pixel.
+    fn plainly(planes: Planes<'_>, space: ColourSpace) -> Vec<u8> {
+        let wide = Factors::of(space);
+        let product = |a: i32, b: i16| (8 * a * i32::from(b)) >> 16;
+        let mut data = Vec::new();
+        for row in 0..planes.height {
+            for column in 0..planes.width {
+                let at = row / 2 * planes.width.div_ceil(2) + column / 2;
+                let y = i32::from(planes.y[row * planes.width + column]);
+                let y = product(y - i32::from(wide.luma_offset), wide.luma);
+                let (u, v) = (i32::from(planes.u[at]) - 128, i32::from(planes.v[at]) - 128);
+                let green = product(u, wide.u_green) + product(v, wide.v_green);
+                let colours = [product(v, wide.v_red), green, product(u, wide.u_blue)];
+                data.extend(colours.map(|add| (y + add).clamp(0, 255) as u8));
+            }
+        }
+        data
+    }
+
+    proptest::proptest! {
+        #[test]
+        fn blocks_and_what_is_left_beside_them_are_converted_alike(
+            width in 1_usize..200, height in 1_usize..5, seed: u32, code in 0_u8..10, full_range: bool,
+        ) {
+            let mut state = seed | 1;
+            let data: Vec<u8> = std::iter::repeat_with(|| {
+                state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+                (state >> 24) as u8
+            }).take(Planes::bytes(width, height)).collect();
+            let space = ColourSpace { matrix: Matrix::from_code(code), full_range };
+            let planes = Planes::packed(width, height, &data);
+            proptest::prop_assert_eq!(planes.to_rgb(space).data, plainly(planes, space));
+        }
     }
 
     #[test]

@@ -8,12 +8,14 @@
 //! stamp, by which it is known.
 
 mod process;
+mod stamp;
 
 use super::choice::FrameTimes;
 use super::parked::Parked;
 use crate::formats::ReadError;
 use crate::video::image::Image;
-use process::{Reader, Source, Stamp};
+use process::{Reader, Source};
+use stamp::{Layout, Stamp};
 use std::path::Path;
 use std::sync::Arc;
 
@@ -41,6 +43,8 @@ pub struct Index {
     stamps: Arc<Vec<i64>>,
     /// Frames at which decoding can start, ascending; none where the file has to be read from its start.
     keys: Option<Arc<Vec<usize>>>,
+    /// What all frames seen when it was opened can come as.
+    layout: Layout,
     /// Processes that stand in the middle of the file.
     parked: Arc<Parked<Reader>>,
     /// Upright, as decoded.
@@ -77,8 +81,11 @@ pub fn open(path: &Path, track: Option<u32>) -> Result<(Index, FrameTimes), Read
         return Err(source.nothing());
     };
     let micros: Vec<i64> = stamps.iter().map(|stamp| stamp - stamps[0]).collect();
+    let layout = first.layout();
+    let alike = frames.iter().all(|frame| frame.layout() == layout);
     let index = Index {
         source: Arc::new(source),
+        layout: if alike { layout } else { Layout::Rgb },
         stamps: Arc::new(stamps),
         keys: keys.map(Arc::new),
         parked: Arc::default(),
@@ -113,25 +120,25 @@ impl Index {
     }
 
     /// A process that has yet to hand over `frame`.
-    fn reader(&self, frame: usize) -> Result<Reader, ReadError> {
+    fn reader(&self, frame: usize, layout: Layout) -> Result<Reader, ReadError> {
         let key = self.key(frame, 0);
         let standing = self.parked.take(|reader| {
             let (position, sequential) = (reader.position, self.keys.is_none());
             let near = sequential || key <= position + TRIAL;
-            (position <= frame && near).then_some(position)
+            (position <= frame && near && reader.layout == layout).then_some(position)
         });
         if let Some(reader) = standing {
             return Ok(reader);
         }
         if self.keys.is_none() {
-            return self.source.read(false, None);
+            return self.source.read(layout, false, None);
         }
         for earlier in 0..=EARLIER {
             let key = self.key(frame, earlier);
             if key == 0 {
                 break;
             }
-            let mut reader = self.source.read(true, Some(self.stamps[key]))?;
+            let mut reader = self.source.read(layout, true, Some(self.stamps[key]))?;
             // Only what comes behind a key frame that is known is known to be whole.
             let found = reader.peek().and_then(|stamp| self.find(stamp.time?));
             if let Some(found) =
@@ -141,7 +148,7 @@ impl Index {
                 return Ok(reader);
             }
         }
-        self.source.read(true, None)
+        self.source.read(layout, true, None)
     }
 
     fn find(&self, time: i64) -> Option<usize> {
@@ -154,6 +161,7 @@ impl Index {
 #[derive(Debug)]
 pub struct Wanted {
     index: Index,
+    layout: Layout,
     /// None before the first frame and after the last.
     reader: Option<Reader>,
     frames: Vec<usize>,
@@ -166,6 +174,7 @@ impl Wanted {
     pub fn new(index: &Index, frames: Vec<usize>) -> Self {
         Wanted {
             index: index.clone(),
+            layout: index.layout,
             reader: None,
             frames,
             delivered: 0,
@@ -179,7 +188,7 @@ impl Wanted {
             return found;
         }
         // A decoder that started in the middle may leave frames out that it has when it started at the beginning.
-        self.reader = Some(self.index.source.read(true, None)?);
+        self.reader = Some(self.index.source.read(self.layout, true, None)?);
         self.next_picture(frame)
     }
 
@@ -191,9 +200,9 @@ impl Wanted {
         };
         if self.reader.as_ref().is_none_or(far) {
             self.reader = None;
-            self.reader = Some(self.index.reader(frame)?);
+            self.reader = Some(self.index.reader(frame, self.layout)?);
         }
-        let Some(reader) = &mut self.reader else {
+        let Some(mut reader) = self.reader.as_mut() else {
             return Err(self.index.source.nothing());
         };
         loop {
@@ -201,6 +210,12 @@ impl Wanted {
             let Some(stamp) = reader.peek() else {
                 return Err(reader.failure(frame, missing));
             };
+            if ![Layout::Rgb, stamp.layout()].contains(&reader.layout) {
+                // The format changes on the way: `ffmpeg` converts whatever it is.
+                self.layout = Layout::Rgb;
+                reader = self.reader.insert(self.index.reader(frame, self.layout)?);
+                continue;
+            }
             if self.index.keys.is_some() {
                 let Some(found) = stamp.time.and_then(|time| self.index.find(time)) else {
                     // A picture that is none of the table's.
@@ -258,15 +273,12 @@ mod tests {
     #[test]
     fn streams_without_usable_times_are_evenly_spaced() {
         let frames = |times: &[Option<i64>]| -> Vec<Stamp> {
-            times
-                .iter()
-                .map(|time| Stamp {
-                    time: *time,
-                    width: 2,
-                    height: 2,
-                    pixel_aspect: 1.0,
-                })
-                .collect()
+            let line = |time: Option<i64>| {
+                let time = time.map_or("NOPTS".to_owned(), |time| time.to_string());
+                format!("[showinfo] n:0 pts:{time} sar:1/1 s:2x2")
+            };
+            let stamps = times.iter().map(|time| Stamp::parse(&line(*time)));
+            stamps.map(Option::unwrap).collect()
         };
         let good = [Some(5), Some(20), Some(70)];
         assert_eq!(repaired(&frames(&good)), [5, 20, 70]);

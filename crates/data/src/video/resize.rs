@@ -4,6 +4,9 @@
 //! being left to a library's idea of a box filter. Where the target is larger than the source, area interpolation becomes
 //! linear interpolation between the two source pixels that a target pixel touches.
 
+// Vector instructions reach only what is inlined.
+#![allow(clippy::inline_always)]
+
 use crate::video::image::{Image, SquareFit, squared};
 
 impl Image {
@@ -143,9 +146,14 @@ pub fn window(
         sums.fill(0.0);
         for share in row {
             let line = &image.data[share.index * stride + first * 3..][..used];
-            for (sum, value) in sums.iter_mut().zip(line) {
-                *sum += share.weight * f32::from(*value);
-            }
+            pulp::Arch::new().dispatch(
+                #[inline(always)]
+                || {
+                    for (sum, value) in sums.iter_mut().zip(line) {
+                        *sum += share.weight * f32::from(*value);
+                    }
+                },
+            );
         }
         for column in &columns {
             let mut pixel = [0.0_f32; 3];

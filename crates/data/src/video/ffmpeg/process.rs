@@ -1,7 +1,9 @@
 //! One run of `ffmpeg`: pictures as raw bytes on its output, and on its errors, line by line, when each is shown.
 
+use super::stamp::{Layout, Stamp};
 use crate::formats::ReadError;
 use crate::formats::read_error::Position;
+use crate::video::colour::Planes;
 use crate::video::image::Image;
 use std::ffi::OsString;
 use std::io::{BufRead, BufReader, Read};
@@ -29,44 +31,6 @@ pub fn available() -> bool {
             .status()
             .is_ok_and(|status| status.success())
     })
-}
-
-/// A decoded frame, without its picture.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Stamp {
-    /// Microseconds; none where the stream says none.
-    pub time: Option<i64>,
-    pub width: u32,
-    pub height: u32,
-    /// Width to height of a pixel.
-    pub pixel_aspect: f64,
-}
-
-impl Stamp {
-    /// From a line of the filter `showinfo`.
-    fn parse(line: &str) -> Option<Self> {
-        if !line.contains("showinfo") {
-            return None;
-        }
-        let field = |name: &str| {
-            let (_, rest) = line.split_once(name)?;
-            rest.split_ascii_whitespace().next()
-        };
-        field(" n:")?;
-        let (width, height) = field(" s:")?.split_once('x')?;
-        let (wide, high) = field(" sar:")?.split_once('/')?;
-        let (wide, high): (f64, f64) = (wide.parse().ok()?, high.parse().ok()?);
-        Some(Stamp {
-            time: field(" pts:")?.parse().ok(),
-            width: width.parse().ok()?,
-            height: height.parse().ok()?,
-            pixel_aspect: if wide > 0.0 && high > 0.0 {
-                wide / high
-            } else {
-                1.0
-            },
-        })
-    }
 }
 
 /// What the container says, packet by packet.
@@ -151,7 +115,7 @@ impl Source {
     pub fn packets(&self) -> Result<Packets, ReadError> {
         let mut command = self.command(true, None);
         command.args(["-c", "copy", "-copyinkf", "-f", "framecrc", "-"]);
-        let mut reader = Reader::new(&self.path, self.start(command)?);
+        let mut reader = Reader::new(&self.path, self.start(command)?, Layout::Rgb, false);
         let mut packets = Packets {
             plain: true,
             ..Packets::default()
@@ -206,7 +170,7 @@ impl Source {
             command.arg("-frames:v").arg(most.to_string());
         }
         command.args(["-f", "null", "-"]);
-        let mut reader = Reader::new(&self.path, self.start(command)?);
+        let mut reader = Reader::new(&self.path, self.start(command)?, Layout::Rgb, true);
         let frames: Vec<Stamp> = std::iter::from_fn(|| reader.take_stamp())
             .take(most.unwrap_or(usize::MAX))
             .collect();
@@ -217,10 +181,16 @@ impl Source {
     }
 
     /// Starts reading pictures, from the start or about `seek` microseconds.
-    pub fn read(&self, keep_times: bool, seek: Option<i64>) -> Result<Reader, ReadError> {
+    pub fn read(
+        &self,
+        layout: Layout,
+        keep_times: bool,
+        seek: Option<i64>,
+    ) -> Result<Reader, ReadError> {
         let mut command = self.with_stamps(keep_times, seek);
-        command.args(["-pix_fmt", "rgb24", "-f", "rawvideo", "-"]);
-        let mut reader = Reader::new(&self.path, self.start(command)?);
+        command.args(["-pix_fmt", layout.name(), "-f", "rawvideo", "-"]);
+        let colours = layout != Layout::Rgb;
+        let mut reader = Reader::new(&self.path, self.start(command)?, layout, colours);
         reader.sought = seek.is_some();
         Ok(reader)
     }
@@ -252,6 +222,7 @@ pub(super) struct Reader {
     pub position: usize,
     /// It started in the middle of the file.
     pub sought: bool,
+    pub layout: Layout,
     scratch: Vec<u8>,
 }
 
@@ -281,31 +252,48 @@ impl Said {
     }
 }
 
-fn listen(pipe: impl Read, stamps: &Sender<Stamp>) -> Said {
+/// Hands on the stamp of every frame; with `colours` once these are said, or where they are not, with the next frame.
+fn listen(pipe: impl Read, stamps: &Sender<Stamp>, colours: bool) -> Said {
     let mut pipe = BufReader::new(pipe);
     let mut said = Said::default();
     let mut line = Vec::new();
+    let mut held: Option<Stamp> = None;
+    // Nobody waits for frames any more: what is said is still worth hearing.
+    let send = |stamp: Option<Stamp>| {
+        if let Some(stamp) = stamp {
+            let _ = stamps.send(stamp);
+        }
+    };
     loop {
         line.clear();
         match (&mut pipe).take(LONGEST_LINE).read_until(b'\n', &mut line) {
-            Ok(0) | Err(_) => return said,
+            Ok(0) | Err(_) => {
+                send(held);
+                return said;
+            }
             Ok(_) => {}
         }
         let line = String::from_utf8_lossy(&line);
-        match Stamp::parse(&line) {
-            // Nobody waits for frames any more: what is said is still worth hearing.
-            Some(stamp) => drop(stamps.send(stamp)),
-            None => said.hear(&line),
+        if let Some(stamp) = Stamp::parse(&line) {
+            send(held.replace(stamp));
+            if !colours {
+                send(held.take());
+            }
+        } else if held.as_mut().is_some_and(|stamp| stamp.add_colours(&line)) {
+            send(held.take());
+        } else {
+            said.hear(&line);
         }
     }
 }
 
 impl Reader {
-    fn new(path: &Path, mut child: Child) -> Self {
+    fn new(path: &Path, mut child: Child, layout: Layout, colours: bool) -> Self {
         let (sender, stamps) = channel();
         let pipe = child.stdout.take();
         let stderr = child.stderr.take();
-        let listener = stderr.map(|pipe| std::thread::spawn(move || listen(pipe, &sender)));
+        let listener =
+            stderr.map(|pipe| std::thread::spawn(move || listen(pipe, &sender, colours)));
         Reader {
             path: path.to_owned(),
             child,
@@ -315,6 +303,7 @@ impl Reader {
             next: None,
             position: 0,
             sought: false,
+            layout,
             scratch: Vec::new(),
         }
     }
@@ -335,13 +324,21 @@ impl Reader {
     /// The next picture.
     pub fn image(&mut self) -> Result<Image, String> {
         let stamp = self.take_stamp().ok_or("ffmpeg decodes no more frames")?;
-        let mut data = Vec::new();
-        self.pixels(stamp, &mut data)?;
-        Ok(Image {
-            width: stamp.width,
-            height: stamp.height,
-            data,
-        })
+        if self.layout == Layout::Rgb {
+            let mut data = Vec::new();
+            self.pixels(stamp, &mut data)?;
+            return Ok(Image {
+                width: stamp.width,
+                height: stamp.height,
+                data,
+            });
+        }
+        let mut scratch = std::mem::take(&mut self.scratch);
+        let read = self.pixels(stamp, &mut scratch);
+        self.scratch = scratch;
+        read?;
+        let planes = Planes::packed(stamp.width as usize, stamp.height as usize, &self.scratch);
+        Ok(planes.to_rgb(stamp.colours()))
     }
 
     /// Leaves the next picture out.
@@ -358,7 +355,11 @@ impl Reader {
         if width == 0 || height == 0 || width.saturating_mul(height) > MOST_PIXELS {
             return Err(format!("a picture of {width} x {height} pixels"));
         }
-        data.resize(width * height * 3, 0);
+        let bytes = match self.layout {
+            Layout::Rgb => width * height * 3,
+            Layout::Planes | Layout::FullRangePlanes => Planes::bytes(width, height),
+        };
+        data.resize(bytes, 0);
         let pipe = self.pipe.as_mut().ok_or("ffmpeg gave no pipe")?;
         pipe.read_exact(data)
             .map_err(|_| "ffmpeg stopped in the middle of a picture".to_owned())
@@ -405,26 +406,6 @@ mod tests {
     use super::*;
 
     #[test]
-    fn lines_of_showinfo_become_stamps() {
-        let line = "[Parsed_showinfo_1 @ 0x55] [info] n:   1 pts:  33333 pts_time:0.033333 pos:     1368 fmt:yuv420p \
-                    sar:4/3 s:72x64 i:P iskey:0 type:B ";
-        let stamp = Stamp::parse(line).unwrap();
-        assert_eq!(
-            (stamp.time, stamp.width, stamp.height),
-            (Some(33333), 72, 64)
-        );
-        assert!((stamp.pixel_aspect - 4.0 / 3.0).abs() < 1e-9);
-        let none = line.replace("  33333", "NOPTS").replace("4/3", "0/1");
-        let stamp = Stamp::parse(&none).unwrap();
-        assert_eq!((stamp.time, stamp.pixel_aspect), (None, 1.0));
-        assert_eq!(Stamp::parse("[info] Input #0, mov"), None);
-        assert_eq!(
-            Stamp::parse("[Parsed_showinfo_1 @ 0x55] [info] color_range:tv"),
-            None
-        );
-    }
-
-    #[test]
     fn the_last_complaints_are_kept() {
         let lines: Vec<String> = (0..100)
             .map(|number| format!("[h264 @ 0x1] [error] error {number}\n"))
@@ -432,10 +413,32 @@ mod tests {
         let head = "[info] Input #0, mov,mp4, from 'file:x':\n";
         let text = format!("{head}{}", lines.concat());
         let (sender, _stamps) = channel();
-        let said = listen(text.as_bytes(), &sender);
+        let said = listen(text.as_bytes(), &sender, true);
         assert_eq!(said.container, "mov,mp4");
         assert_eq!(said.complaints.len(), COMPLAINTS);
         assert_eq!(said.complaints.last().unwrap(), "error 99");
+    }
+
+    #[test]
+    fn a_stamp_waits_for_its_colours_where_they_count() {
+        let frame = |n: usize| {
+            format!(
+                "[Parsed_showinfo_1 @ 0x5] [info] n:{n} pts:{n} fmt:yuv420p sar:1/1 s:4x4 i:P\n"
+            )
+        };
+        let colours = "[Parsed_showinfo_1 @ 0x5] [info] color_range:tv color_space:bt709\n";
+        let text = format!("{}{colours}{}{}{colours}", frame(0), frame(1), frame(2));
+        for (wait, layouts) in [
+            (true, [Layout::Planes, Layout::Rgb, Layout::Planes]),
+            (false, [Layout::Rgb; 3]),
+        ] {
+            let (sender, stamps) = channel();
+            listen(text.as_bytes(), &sender, wait);
+            drop(sender);
+            let heard: Vec<_> = stamps.iter().map(|s| (s.time, s.layout())).collect();
+            let right: Vec<_> = (0..3).map(|n| (Some(n as i64), layouts[n])).collect();
+            assert_eq!(heard, right);
+        }
     }
 
     #[test]
