@@ -9,8 +9,9 @@
 //! under `mpirun`. Efficiency is the time of one process over ranks times the time of a rank; at least 0.85 is asked for. Nothing
 //! else may run on the machine.
 //!
-//! With `--plan` the model of a step is calibrated by what one rank computes beside others that it does not talk to and by a
-//! reduction with nothing beside it, and compared with 1, 2 and 4 ranks; asked for: within 20 %.
+//! With `--plan` the model of a step is calibrated by what one rank computes beside others that it does not talk to, and by a
+//! reduction with nothing beside it: how long it takes, and how much of that the cores are busy. It is compared with 1, 2 and 4 ranks;
+//! asked for: within 20 %. More ranks than cores share them while they compute and while they reduce, and both are measured so.
 
 use clap::Parser;
 use reviv::engine::communicator::launch;
@@ -164,8 +165,20 @@ fn seconds(ranks: Communicator, batch: usize, steps: usize) -> f64 {
     start.elapsed().as_secs_f64() / steps as f64
 }
 
-/// Seconds of the reduction of a gradient on this rank, with nothing beside it.
-fn reduction(ranks: &Communicator, times: usize) -> f64 {
+/// Seconds that processors have worked for this process so far, as Linux counts them in hundredths; 0 elsewhere.
+fn worked() -> f64 {
+    let text = std::fs::read_to_string("/proc/self/stat").unwrap_or_default();
+    // The name of the program stands in brackets, and may hold anything.
+    let fields = text.rsplit(')').next().unwrap_or_default();
+    let ticks = fields.split_whitespace().skip(11).take(2);
+    ticks
+        .filter_map(|ticks| ticks.parse::<f64>().ok())
+        .sum::<f64>()
+        / 100.0
+}
+
+/// Seconds of the reduction of a gradient on this rank, with nothing beside it, and those that processors have worked for it.
+fn reduction(ranks: &Communicator, times: usize) -> [f64; 2] {
     let mut model = Mget::new(&spec(), &Initialise::new(&Compute::cpu(), 0)).expect("the spec");
     model.start_training();
     let mut gradients = Gradients::default();
@@ -177,27 +190,39 @@ fn reduction(ranks: &Communicator, times: usize) -> f64 {
         Some(sum.finish(&model).expect("the others"))
     };
     reduce();
-    let start = Instant::now();
+    let (start, before) = (Instant::now(), worked());
     for _ in 0..times {
         reduce();
     }
-    start.elapsed().as_secs_f64() / times as f64
+    [start.elapsed().as_secs_f64(), worked() - before].map(|seconds| seconds / times as f64)
 }
 
 fn part(part: Part, arguments: &Arguments) {
     let ranks = launch::launch(|error| panic!("{error}")).expect("the other processes");
-    let seconds = match part {
-        Part::Step => seconds(ranks.clone(), arguments.batch, arguments.steps),
+    let [seconds, worked] = match part {
+        Part::Step => [
+            seconds(ranks.clone(), arguments.batch, arguments.steps),
+            0.0,
+        ],
         Part::Reduction => reduction(&ranks, arguments.steps),
     };
+    let worked = ranks.gather(Ok(worked.to_le_bytes().to_vec()));
+    let worked = worked.expect("the other processes").into_iter();
+    let worked = worked.map(|bytes| f64::from_le_bytes(bytes.try_into().expect("a number")));
+    let worked: f64 = worked.sum();
     if ranks.is_root() {
-        println!("{seconds}");
+        println!("{seconds} {worked}");
     }
     ranks.finish().expect("all leave together");
 }
 
 /// The longest that a process of those takes.
-fn measure(mut commands: Vec<Command>, part: Part, batch: usize, steps: usize) -> f64 {
+fn measure(commands: Vec<Command>, part: Part, batch: usize, steps: usize) -> f64 {
+    measure_both(commands, part, batch, steps)[0]
+}
+
+/// The same, and the most that processors have worked meanwhile for all of its ranks.
+fn measure_both(mut commands: Vec<Command>, part: Part, batch: usize, steps: usize) -> [f64; 2] {
     let started: Vec<_> = commands
         .iter_mut()
         .map(|command| {
@@ -213,9 +238,12 @@ fn measure(mut commands: Vec<Command>, part: Part, batch: usize, steps: usize) -
     let ended = started.into_iter().map(|process| {
         let output = process.wait_with_output().expect("its end");
         let text = String::from_utf8_lossy(&output.stdout).into_owned();
-        text.trim().parse::<f64>().expect("the seconds")
+        let numbers = text.split_whitespace();
+        let numbers = numbers.map(|number| number.parse::<f64>().expect("seconds"));
+        let numbers: Vec<f64> = numbers.collect();
+        <[f64; 2]>::try_from(numbers).expect("two numbers")
     });
-    ended.fold(0.0, f64::max)
+    ended.fold([0.0; 2], |[a, b], [c, d]| [a.max(c), b.max(d)])
 }
 
 /// Processes that know nothing of each other.
@@ -243,9 +271,10 @@ fn compare(batch: usize, steps: usize) {
         parameters / 1e6
     );
     println!(
-        "| processes | computing alone (s) | reduction alone (s) | step planned (s) | step measured (s) | off |"
+        "| processes | computing alone (s) | reduction alone (s) | cores busy with it | step planned (s) | step measured (s) | off |"
     );
-    println!("|---|---|---|---|---|---|");
+    println!("|---|---|---|---|---|---|---|");
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
     for n in [1, 2, 4] {
         let computing = measure(apart(n), Part::Step, batch / n, steps);
         let devices = n as f64;
@@ -259,9 +288,14 @@ fn compare(batch: usize, steps: usize) {
             sharded: false,
         };
         let mut link: Interconnect = INTERCONNECTS[5];
+        link.busy = 0.0;
         let (mut reducing, mut measured) = (0.0, computing);
         if n > 1 {
-            reducing = measure(mpirun(n), Part::Reduction, batch, steps);
+            let worked;
+            [reducing, worked] = measure_both(mpirun(n), Part::Reduction, batch, 4 * steps);
+            // Cores without a rank do it for nothing.
+            let busy = worked / reducing - cores.saturating_sub(n) as f64;
+            link.busy = (busy / cores.min(n) as f64).clamp(0.0, 1.0);
             measured = measure(mpirun(n), Part::Step, batch, steps);
             link.bytes_per_second = 2.0 * 4.0 * parameters * (devices - 1.0) / devices / reducing;
             link.latency = 0.0;
@@ -280,7 +314,8 @@ fn compare(batch: usize, steps: usize) {
         let planned = cost.compute + cost.exposed;
         let off = 100.0 * (planned / measured - 1.0);
         println!(
-            "| {n} | {computing:.3} | {reducing:.3} | {planned:.3} | {measured:.3} | {off:+.0} % |"
+            "| {n} | {computing:.3} | {reducing:.3} | {:.0} % | {planned:.3} | {measured:.3} | {off:+.0} % |",
+            100.0 * link.busy
         );
     }
 }

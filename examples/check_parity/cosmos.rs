@@ -4,7 +4,7 @@ use std::path::Path;
 
 use burn::tensor::{Tensor, TensorData};
 use reviv::engine::parameters::to_host;
-use reviv::engine::{Initialise, Parameters, Weights};
+use reviv::engine::{Cuts, Initialise, Parameters, Weights};
 use reviv::tokenizer::video::layers::Extent;
 use reviv::tokenizer::video::padding::Padding;
 use reviv::tokenizer::video::{Fsq, Network, VideoSettings, haar};
@@ -196,8 +196,8 @@ fn network(mut file: Vectors, report: &mut Report) -> Outcome {
         height: pixels[1] / settings.patch,
         width: pixels[2] / settings.patch,
     };
-    let (hidden, _) = network.hidden(x.clone(), extent);
-    let (latent, extent) = network.encode(x, extent);
+    let (hidden, _) = network.hidden(x.clone(), extent, &mut Cuts::none());
+    let (latent, extent) = network.encode(x, extent, &mut Cuts::none());
     let fsq = Fsq::new(&settings.levels);
     let z = to_host(latent);
     let tokens = fsq.encode(&z);
@@ -220,7 +220,7 @@ fn network(mut file: Vectors, report: &mut Report) -> Outcome {
         TensorData::new(code, [tokens.len(), fsq.width()]),
         compute.device(),
     );
-    let (coefficients, _) = network.decode(code, extent);
+    let (coefficients, _) = network.decode(code, extent, &mut Cuts::none());
     let back = haar::inverse(&to_host(coefficients), pixels, settings.patch);
     file.compare(report, "recon", shape, &channels(&back, shape, false))?;
     file.finish(report);

@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use reviv::engine::parameters::to_host;
-use reviv::engine::{Compute, Gradients, Initialise, Parameters};
+use reviv::engine::{Compute, Cuts, Gradients, Initialise, Parameters};
 use reviv::modality::Shape;
 use reviv::tokenizer::quantizer::{Assignment, Quantizer, Update};
 use reviv::tokenizer::vq::{Batch, Loss, VqSettings, VqVae};
@@ -177,7 +177,7 @@ fn one(mut file: Vectors, report: &mut Report) -> Outcome {
     )?;
 
     model.start_training();
-    let trained = model.forward_training(&batch);
+    let trained = model.forward_training(&batch, &mut Cuts::none());
     for (name, value) in [
         ("train_recon_loss", trained.reconstruction),
         ("train_commit_loss", trained.commitment),
@@ -286,7 +286,7 @@ fn evaluate(
     let (width, code) = (model.settings().width, model.settings().code_width);
     let samples = clips.len();
     let shaped = |channels: usize| [&[samples, channels], grid].concat();
-    let hidden = model.encode_hidden(batch);
+    let hidden = model.encode_hidden(batch, &mut Cuts::none());
     let states = to_host(hidden.clone());
     file.compare(
         report,

@@ -1,5 +1,6 @@
 //! Where a stage computes.
 
+use crate::engine::communicator::reduce::Reduction;
 use crate::engine::compute::OutOfMemory;
 use crate::engine::{Communicator, Compute, DeviceChoice, DeviceKind, Precision};
 use crate::experiment::{Code, StageContext, StageError};
@@ -30,6 +31,20 @@ pub(super) fn compute(
         context.log(&format!("computes on {}", compute.name()));
     }
     Ok(compute)
+}
+
+/// The ranks of a training on this device, all of which must be here; says how gradients travel between GPUs.
+pub(super) fn ranks(
+    compute: &Compute,
+    reduction: Reduction,
+    context: &mut dyn StageContext,
+) -> Result<Communicator, StageError> {
+    let ranks = Communicator::world().on(compute, reduction);
+    let (ranks, how) = ranks.map_err(StageError::other)?;
+    if let Some(how) = how {
+        context.log(&how);
+    }
+    Ok(ranks)
 }
 
 /// What a panic of the tensor library with this text says, where it says that a device's memory is full; `lower` is what to lower.

@@ -14,8 +14,9 @@ use super::TokenizerError;
 use super::patches::Patches;
 use super::quantizer::{Assignment, Quantizer};
 use super::whitening::{Whitening, scale};
+use crate::engine::cuts::backward_order;
 use crate::engine::parameters::to_host;
-use crate::engine::{Initialise, Parameter, Parameters, Segments, ops, parameters};
+use crate::engine::{Cuts, Initialise, Parameter, Parameters, Segments, ops, parameters};
 use crate::modality::Shape;
 use crate::nn::positions;
 use crate::nn::{Block, LayerNorm, Linear, Mlp};
@@ -101,16 +102,15 @@ impl Transformer {
     }
 
     /// `[N, D]` of `samples` signals to `[N, D]`.
-    fn forward(&self, h_ND: Tensor<2>, samples: usize) -> Tensor<2> {
+    fn forward(&self, h_ND: Tensor<2>, samples: usize, cuts: &mut Cuts) -> Tensor<2> {
         let [tokens, width] = h_ND.dims();
         let each = tokens / samples;
         let table = self.position_embeddings.reshaped([1, each, width]);
         let h_ND = (h_ND.reshape([samples, each, width]) + table).reshape([tokens, width]);
         let segments = Segments::batch(samples, each);
-        let h_ND = self
-            .blocks
-            .iter()
-            .fold(h_ND, |h_ND, block| block.forward(h_ND, &segments));
+        let blocks = self.blocks.iter();
+        let h_ND = blocks.fold(h_ND, |h_ND, block| block.forward(cuts.at(h_ND), &segments));
+        let h_ND = cuts.at(h_ND);
         h_ND.clone() + self.post_mlp.forward_tanh(self.norm_mlp.forward(h_ND))
     }
 }
@@ -273,9 +273,10 @@ impl VqVae {
 
     /// Hidden states of the encoder, `[N, D]`.
     #[must_use]
-    pub fn encode_hidden(&self, batch: &Batch) -> Tensor<2> {
+    pub fn encode_hidden(&self, batch: &Batch, cuts: &mut Cuts) -> Tensor<2> {
         let h_ND = self.encoder.conv.forward(batch.values_NP.clone());
-        self.encoder.transformer.forward(h_ND, batch.samples)
+        let transformer = &self.encoder.transformer;
+        transformer.forward(h_ND, batch.samples, cuts)
     }
 
     /// Latents before quantisation, `[N, L]`, of hidden states.
@@ -286,16 +287,16 @@ impl VqVae {
 
     /// Reconstructed patches, `[N, P]`, of `samples` signals from quantised latents `[N, L]`.
     #[must_use]
-    pub fn decode_latents(&self, q_NL: Tensor<2>, samples: usize) -> Tensor<2> {
+    pub fn decode_latents(&self, q_NL: Tensor<2>, samples: usize, cuts: &mut Cuts) -> Tensor<2> {
         let h_ND = self.post_quant_proj.forward(q_NL);
-        let h_ND = self.decoder.transformer.forward(h_ND, samples);
+        let h_ND = self.decoder.transformer.forward(h_ND, samples, cuts);
         self.decoder.out_proj.forward(h_ND)
     }
 
     /// Tokens of a batch, `[N]`.
     #[must_use]
     pub fn encode(&self, batch: &Batch) -> Vec<u32> {
-        let z_NL = self.latents(self.encode_hidden(batch));
+        let z_NL = self.latents(self.encode_hidden(batch, &mut Cuts::none()));
         self.quantize.assign(to_host(z_NL)).ids
     }
 
@@ -305,7 +306,7 @@ impl VqVae {
     /// When a token is outside the vocabulary.
     #[must_use]
     pub fn decode(&self, ids: &[u32], samples: usize) -> Tensor<2> {
-        self.decode_latents(self.codes(ids), samples)
+        self.decode_latents(self.codes(ids), samples, &mut Cuts::none())
     }
 
     /// The codes of `ids` as a tensor, `[N, L]`.
@@ -420,7 +421,8 @@ impl VqVae {
             .map_err(|error| TokenizerError::Other(error.to_string()))?;
         let mut latents = Whitening::new(self.settings.code_width);
         for batch in batches {
-            latents.add(&to_host(self.latents(self.encode_hidden(batch))));
+            let hidden = self.encode_hidden(batch, &mut Cuts::none());
+            latents.add(&to_host(self.latents(hidden)));
         }
         let spread = (self.settings.code_width as f64).powf(-0.5);
         latents.apply(&mut weights, "quant_proj", spread)?;
@@ -428,16 +430,25 @@ impl VqVae {
             .map_err(|error| TokenizerError::Other(error.to_string()))
     }
 
-    /// One forward pass with straight-through codes: gradients pass the codebook as if it were not there, and the commitment
-    /// loss pulls latents to their codes. The codebook itself is moved by [`Quantizer::update`].
+    /// The names of all parameters, about in the order in which backward is done with them.
     #[must_use]
-    pub fn forward_training(&self, batch: &Batch) -> Trained {
-        let z_NL = self.latents(self.encode_hidden(batch));
+    pub fn backward_order(&self) -> Vec<String> {
+        let stages = ["encoder.", "quant_proj.", "post_quant_proj.", "decoder."];
+        backward_order(self, &stages)
+    }
+
+    /// One forward pass with straight-through codes: gradients pass the codebook as if it were not there, and the commitment
+    /// loss pulls latents to their codes. The codebook itself is moved by [`Quantizer::update`]. Backward can go block by block.
+    #[must_use]
+    pub fn forward_training(&self, batch: &Batch, cuts: &mut Cuts) -> Trained {
+        let z_NL = self.latents(self.encode_hidden(batch, cuts));
+        let z_NL = cuts.at(z_NL);
         let assignment = self.quantize.assign(to_host(z_NL.clone()));
         let q_NL = self.codes(&assignment.ids);
         let step_NL = q_NL - z_NL.clone();
         let commitment = step_NL.clone().square().mean();
-        let found_NP = self.decode_latents(z_NL + step_NL.detach(), batch.samples);
+        let passed_NL = z_NL + step_NL.detach();
+        let found_NP = self.decode_latents(passed_NL, batch.samples, cuts);
         let reconstruction = self.loss(found_NP, batch);
         let parts = vec![reconstruction.clone(), commitment.clone()];
         let parts = to_host(Tensor::cat(parts, 0));

@@ -14,7 +14,7 @@ use crate::clip::Signal;
 use crate::engine::communicator::reduce::Reduction;
 use crate::engine::gradients::Complete;
 use crate::engine::parameters::to_host;
-use crate::engine::{Communicator, Gradients, Parameters};
+use crate::engine::{Communicator, Cuts, Gradients, Parameters, Tensor};
 use crate::geometry::skeleton::HAND;
 use crate::tokenizer::quantizer::Assignment;
 use crate::tokenizer::trained::{Prepared, batch};
@@ -158,13 +158,19 @@ impl Objective for VqReconstruction {
         &mut self.model
     }
 
+    fn backward_order(&self) -> Vec<String> {
+        self.model.backward_order()
+    }
+
     fn micro_step(
         &self,
         signals: &Vec<Prepared>,
         share: f64,
-        _: Option<&mut Complete<'_>>,
+        complete: Option<&mut Complete<'_>>,
     ) -> Result<MicroStep<Assignment>, TrainingError> {
-        let trained = self.model.forward_training(&batch(&self.model, signals));
+        let mut cuts = Cuts::wanted(complete.is_some());
+        let batch = batch(&self.model, signals);
+        let trained = self.model.forward_training(&batch, &mut cuts);
         let weight = self.model.settings().commitment_weight;
         let loss = trained.reconstruction + weight * trained.commitment;
         let samples = signals.len() as f64;
@@ -180,7 +186,7 @@ impl Objective for VqReconstruction {
             ],
             gradients: loss
                 .is_finite()
-                .then(|| Gradients::of(&(trained.loss * share), &self.model)),
+                .then(|| gradients(cuts, &(trained.loss * share), &self.model, complete)),
             used: used(signals.len()),
             trace: trained.assignment,
         })
@@ -232,7 +238,7 @@ impl VideoReconstruction {
             let Some(clip) = clip(index)? else {
                 return Ok(None);
             };
-            let trained = tokenizer.train(&[clip])?;
+            let trained = tokenizer.train(&[clip], &mut Cuts::none())?;
             // As bits: a loss need not be a number.
             Ok::<_, TrainingError>(Some(trained.loss.into_scalar::<f32>().to_bits()))
         })?;
@@ -269,20 +275,25 @@ impl Objective for VideoReconstruction {
         self.model.network_mut()
     }
 
+    fn backward_order(&self) -> Vec<String> {
+        self.model.network().backward_order()
+    }
+
     fn micro_step(
         &self,
         clips: &Vec<Signal>,
         share: f64,
-        _: Option<&mut Complete<'_>>,
+        complete: Option<&mut Complete<'_>>,
     ) -> Result<MicroStep<()>, TrainingError> {
         if clips.is_empty() {
             return Err(TrainingError::NoData);
         }
-        let trained = self.model.train(clips)?;
+        let mut cuts = Cuts::wanted(complete.is_some());
+        let trained = self.model.train(clips, &mut cuts)?;
         let loss = f64::from(trained.loss.clone().into_scalar::<f32>());
         let gradients = loss.is_finite().then(|| {
             let total = trained.loss + trained.unevenness * EVENNESS;
-            Gradients::of(&(total * share), self.model.network())
+            gradients(cuts, &(total * share), self.model.network(), complete)
         });
         Ok(MicroStep {
             loss,
@@ -291,6 +302,19 @@ impl Objective for VideoReconstruction {
             used: used(clips.len()),
             trace: (),
         })
+    }
+}
+
+/// The gradients of a loss; `complete` hears of those of a block while backward goes on with the one before it.
+fn gradients<M: Parameters>(
+    cuts: Cuts,
+    loss: &Tensor<1>,
+    model: &M,
+    complete: Option<&mut Complete<'_>>,
+) -> Gradients {
+    match complete {
+        Some(complete) => cuts.gradients(loss, model, complete),
+        None => Gradients::of(loss, model),
     }
 }
 
@@ -342,12 +366,16 @@ mod tests {
     }
 
     fn trainer(settings: &TokenizerTraining) -> Trainer<VqReconstruction> {
+        trainer_of(1, settings)
+    }
+
+    fn trainer_of(depth: usize, settings: &TokenizerTraining) -> Trainer<VqReconstruction> {
         let compute = Compute::cpu();
         let sizes = VqSettings {
             codebook: 32,
             code_width: 4,
             width: 16,
-            depth: 1,
+            depth,
             heads: 2,
             ..VqSettings::default()
         };
@@ -433,6 +461,45 @@ mod tests {
         let first = all.swap_remove(0);
         assert!(all.iter().all(|other| *other == first), "{size} ranks");
         first
+    }
+
+    /// Backward in parts gives the bits of the whole graph, and is done with gradients about in the order in which they are sent.
+    fn assert_in_parts<O: Objective>(objective: &O, batch: &O::Batch) {
+        let whole = objective.micro_step(batch, 0.5, None).unwrap();
+        let bits = |gradient: &Tensor<1>| -> Vec<u32> {
+            let values = to_host(gradient.clone()).into_iter();
+            values.map(f32::to_bits).collect()
+        };
+        let mut told: Vec<(String, Vec<u32>)> = Vec::new();
+        let mut hear = |name: &str, gradient: &Tensor<1>| {
+            if told.iter().all(|(other, _)| other != name) {
+                told.push((name.to_owned(), bits(gradient)));
+            }
+        };
+        let parts = objective.micro_step(batch, 0.5, Some(&mut hear)).unwrap();
+        let (expected, found) = (whole.gradients.unwrap(), parts.gradients.unwrap());
+        assert_eq!((parts.loss, parts.parts), (whole.loss, whole.parts));
+        assert_eq!(found.iter().count(), expected.iter().count());
+        assert_eq!(told.len(), expected.iter().count());
+        let mut order = objective.backward_order();
+        order.retain(|name| expected.get(name).is_some());
+        assert_eq!(told.len(), order.len());
+        for (at, (name, early)) in told.iter().enumerate() {
+            assert_eq!(bits(found.get(name).unwrap()), *early, "{name}");
+            assert_eq!(bits(expected.get(name).unwrap()), *early, "{name}");
+            // A part has at most 14 parameters, in an order of its own.
+            let place = order.iter().position(|other| other == name).unwrap();
+            assert!(place.abs_diff(at) < 14, "{name}: {at}, sent as {place}");
+        }
+    }
+
+    #[test]
+    fn gradients_of_tokenizers_in_parts_are_those_of_the_whole_graph_to_the_bit() {
+        let vq = trainer_of(3, &settings(5, 0));
+        assert_in_parts(vq.objective(), &data());
+        let model = small([4, 16, 16], [4, 4], &[4, 3], 2);
+        let video = Trainer::video(model, &settings(5, 0)).unwrap();
+        assert_in_parts(video.objective(), &vec![video_clip(0), video_clip(1)]);
     }
 
     /// Codes follow the latents of all ranks, and dead ones are replaced from them.
@@ -568,12 +635,21 @@ mod tests {
         }
     }
 
+    fn video_clip(clip: usize) -> Signal {
+        Signal {
+            values: ArrayD::from_shape_fn(IxDyn(&[4, 16, 16, 3]), |at| {
+                ((at[0] + 2 * at[1] + at[2] + 5 * clip) as f32 * 0.2).sin()
+            }),
+            valid: None,
+        }
+    }
+
     #[test]
     fn a_video_tokenizer_learns_and_resumes_to_the_same_bytes_on_any_number_of_ranks() {
         let start = || {
             let settings = TokenizerTraining {
                 learning_rate: 3e-3,
-                batch: 2,
+                batch: 12,
                 ..settings(8, 1)
             };
             Trainer::video(small([4, 16, 16], [4, 4], &[4, 3], 2), &settings).unwrap()
@@ -581,17 +657,11 @@ mod tests {
         let step = |trainer: &mut Trainer<VideoReconstruction>| {
             let mut epochs = Epochs::of(trainer, 5);
             let step = trainer.progress().step;
-            let clip = |clip: usize| Signal {
-                values: ArrayD::from_shape_fn(IxDyn(&[4, 16, 16, 3]), |at| {
-                    ((at[0] + 2 * at[1] + at[2] + 5 * clip) as f32 * 0.2).sin()
-                }),
-                valid: None,
-            };
             let next = |micro| -> Result<Vec<Signal>, TrainingError> {
                 Ok(epochs
                     .choose(step, micro, 5)?
                     .into_iter()
-                    .map(clip)
+                    .map(video_clip)
                     .collect())
             };
             trainer.step(next).unwrap().loss
@@ -611,14 +681,16 @@ mod tests {
             step(&mut resumed);
         }
         assert!(bytes(&resumed) == bytes(&whole));
-        let found = on_ranks(2, |ranks| {
-            let mut trainer = start().shared(ranks, 1).unwrap();
-            for _ in 0..8 {
-                step(&mut trainer);
-            }
-            bytes(&trainer)
-        });
-        assert!(found == bytes(&whole));
+        for size in 1..=4 {
+            let found = on_ranks(size, |ranks| {
+                let mut trainer = start().shared(ranks, 1).unwrap();
+                for _ in 0..8 {
+                    step(&mut trainer);
+                }
+                bytes(&trainer)
+            });
+            assert!(found == bytes(&whole), "{size} ranks");
+        }
     }
 
     #[test]

@@ -12,6 +12,7 @@ use super::schedule::{Schedule, ScheduleError};
 use super::settings::{Keep, SettingsError};
 use super::source::DataError;
 use super::validation::Score;
+use crate::engine::cuts::backward_order;
 use crate::engine::gradients::Complete;
 use crate::engine::{EngineError, Gradients, Parameters, RankError, Weights};
 use crate::formats::ReadError;
@@ -52,11 +53,7 @@ pub trait Objective {
 
     /// The names of the parameters, about in the order in which backward completes their gradients.
     fn backward_order(&self) -> Vec<String> {
-        let mut names = Vec::new();
-        self.module()
-            .visit("", &mut |name, _| names.push(name.to_owned()));
-        names.reverse();
-        names
+        backward_order(self.module(), &[])
     }
 
     /// What the step changes besides what the gradients did, after the optimizer; `step` is counted from 0. Returns further

@@ -1,9 +1,8 @@
 //! Running `op: train_mget`: tokens in, one call, a model folder out.
 
-use super::super::device::compute;
+use super::super::device::{compute, ranks};
 use super::super::evaluate::write_text;
 use super::{TrainMgetSettings, spec};
-use crate::engine::Communicator;
 use crate::experiment::{Code, InputArtifact, StageContext, StageError, TokenFacts};
 use crate::masking::{Masking, PIXELS};
 use crate::mget::MgetSpec;
@@ -76,7 +75,7 @@ pub(super) fn run(
         .collect();
     let held_out = open(first, "validation")?;
     let compute = compute(settings.device, settings.precision, context)?;
-    let ranks = Communicator::world();
+    let ranks = ranks(&compute, settings.training.reduction, context)?;
     let root = ranks.is_root();
     let watch = Stopwatch::start();
     let (input, target) = masking.nominal_tokens();

@@ -1,12 +1,12 @@
 //! Running `op: train_tokenizer`: settings in, one call, scores and pictures out.
 
 use super::super::clip_signals::{damaged, format, modality, open_split};
-use super::super::device::compute;
+use super::super::device::{compute, ranks};
 use super::super::modality_entry::DEFAULTS;
 use super::{TrainTokenizerSettings, picture, report, tokens};
 use crate::clip::joined::Joined;
 use crate::clip::source::ClipSource;
-use crate::engine::{Communicator, Precision};
+use crate::engine::Precision;
 use crate::experiment::{Code, StageContext, StageError};
 use crate::run::checkpoint;
 use crate::training::tokenizer_scores::Scores;
@@ -53,7 +53,8 @@ pub(super) fn run(
     let having = having.count();
     let resume = checkpoint::latest(context.checkpoints());
     let compute = compute(settings.device, Precision::F32, context)?;
-    let ranks = Communicator::world();
+    let training = settings.training(having as u64);
+    let ranks = ranks(&compute, training.reduction, context)?;
     let root = ranks.is_root();
     let fit = TokenizerFit {
         modality: name,
@@ -66,7 +67,7 @@ pub(super) fn run(
         held_out: (!held_out.is_empty()).then_some(&held_out),
         held_out_clips: settings.validation_clips,
         tokenizer: &entry.settings,
-        training: settings.training(having as u64),
+        training,
         intervals: Intervals {
             validate_every: settings.validate_every,
             checkpoint_every: settings.checkpoint_every,

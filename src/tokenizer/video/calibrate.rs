@@ -12,7 +12,7 @@ use burn::tensor::Tensor;
 use super::VideoTokenizer;
 use crate::clip::Signal;
 use crate::engine::parameters::to_host;
-use crate::engine::{Parameters, Values, Weights};
+use crate::engine::{Cuts, Parameters, Values, Weights};
 use crate::tokenizer::TokenizerError;
 use crate::tokenizer::normaliser::Normaliser;
 use crate::tokenizer::whitening::{Whitening, floats, scale};
@@ -54,7 +54,11 @@ impl VideoTokenizer {
         self.load(&weights)?;
         let mut latents = Whitening::new(self.settings().levels.len());
         self.each_clip(count, &mut read, |clip| {
-            latents.add(&to_host(self.latents(self.blocks(&[clip]), 1)));
+            latents.add(&to_host(self.latents(
+                self.blocks(&[clip]),
+                1,
+                &mut Cuts::none(),
+            )));
         })?;
         latents.apply(&mut weights, "quant_conv.conv3d", SPREAD)?;
         for name in ["weight", "bias"] {
@@ -196,7 +200,7 @@ mod tests {
 
         let latents = |clip: &Signal| {
             let values: Vec<f32> = clip.values.iter().copied().collect();
-            to_host(tokenizer.latents(tokenizer.blocks(&[&values]), 1))
+            to_host(tokenizer.latents(tokenizer.blocks(&[&values]), 1, &mut Cuts::none()))
         };
         let mut changed = clips[0].clone();
         changed

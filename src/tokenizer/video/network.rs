@@ -7,7 +7,8 @@ use super::layers::{
     chain, factorised,
 };
 use super::settings::VideoSettings;
-use crate::engine::{Initialise, parameters};
+use crate::engine::cuts::backward_order;
+use crate::engine::{Cuts, Initialise, parameters};
 use crate::tokenizer::TokenizerError;
 
 /// Wavelet coefficients to latents and back.
@@ -52,13 +53,12 @@ impl Middle {
         }
     }
 
-    fn forward(&self, x_NC: Tensor<2>, extent: Extent) -> Tensor<2> {
-        let x_NC = self.block_1.forward(x_NC, extent);
-        let x_NC = self
-            .attn_1
-            .iter()
-            .fold(x_NC, |x_NC, attention| attention.forward(x_NC, extent));
-        self.block_2.forward(x_NC, extent)
+    fn forward(&self, x_NC: Tensor<2>, extent: Extent, cuts: &mut Cuts) -> Tensor<2> {
+        let x_NC = self.block_1.forward(cuts.at(x_NC), extent);
+        let x_NC = self.attn_1.iter().fold(x_NC, |x_NC, attention| {
+            attention.forward(cuts.at(x_NC), extent)
+        });
+        self.block_2.forward(cuts.at(x_NC), extent)
     }
 }
 
@@ -124,18 +124,18 @@ impl Encoder {
         }
     }
 
-    fn forward(&self, x_NC: Tensor<2>, mut extent: Extent) -> (Tensor<2>, Extent) {
+    fn forward(&self, x_NC: Tensor<2>, mut extent: Extent, cuts: &mut Cuts) -> (Tensor<2>, Extent) {
         let mut x_NC = chain(&self.conv_in, x_NC, extent);
         for level in &self.down {
             for block in &level.block {
-                x_NC = block.forward(x_NC, extent);
+                x_NC = block.forward(cuts.at(x_NC), extent);
             }
             if let Some(downsample) = &level.downsample {
-                (x_NC, extent) = downsample.forward(x_NC, extent);
+                (x_NC, extent) = downsample.forward(cuts.at(x_NC), extent);
             }
         }
-        let x_NC = self.mid.forward(x_NC, extent);
-        let x_NC = self.norm_out.forward(x_NC, extent, true);
+        let x_NC = self.mid.forward(x_NC, extent, cuts);
+        let x_NC = self.norm_out.forward(cuts.at(x_NC), extent, true);
         (chain(&self.conv_out, x_NC, extent), extent)
     }
 }
@@ -188,18 +188,18 @@ impl Decoder {
         }
     }
 
-    fn forward(&self, x_NC: Tensor<2>, mut extent: Extent) -> (Tensor<2>, Extent) {
+    fn forward(&self, x_NC: Tensor<2>, mut extent: Extent, cuts: &mut Cuts) -> (Tensor<2>, Extent) {
         let x_NC = chain(&self.conv_in, x_NC, extent);
-        let mut x_NC = self.mid.forward(x_NC, extent);
+        let mut x_NC = self.mid.forward(x_NC, extent, cuts);
         for level in self.up.iter().rev() {
             for block in &level.block {
-                x_NC = block.forward(x_NC, extent);
+                x_NC = block.forward(cuts.at(x_NC), extent);
             }
             if let Some(upsample) = &level.upsample {
-                (x_NC, extent) = upsample.forward(x_NC, extent);
+                (x_NC, extent) = upsample.forward(cuts.at(x_NC), extent);
             }
         }
-        let x_NC = self.norm_out.forward(x_NC, extent, true);
+        let x_NC = self.norm_out.forward(cuts.at(x_NC), extent, true);
         (chain(&self.conv_out, x_NC, extent), extent)
     }
 }
@@ -231,22 +231,39 @@ impl Network {
 
     /// The encoder's output before the projection to latents: `[N, coefficients]` to `[N', latent channels]`.
     #[must_use]
-    pub fn hidden(&self, x_NC: Tensor<2>, extent: Extent) -> (Tensor<2>, Extent) {
-        self.encoder.forward(x_NC, extent)
+    pub fn hidden(&self, x_NC: Tensor<2>, extent: Extent, cuts: &mut Cuts) -> (Tensor<2>, Extent) {
+        self.encoder.forward(x_NC, extent, cuts)
     }
 
     /// Wavelet coefficients `[N, coefficients]` to latents `[N', code width]`, before quantisation.
     #[must_use]
-    pub fn encode(&self, x_NC: Tensor<2>, extent: Extent) -> (Tensor<2>, Extent) {
-        let (h_NC, extent) = self.hidden(x_NC, extent);
+    pub fn encode(&self, x_NC: Tensor<2>, extent: Extent, cuts: &mut Cuts) -> (Tensor<2>, Extent) {
+        let (h_NC, extent) = self.hidden(x_NC, extent, cuts);
         (self.quant_conv.forward(h_NC, extent), extent)
     }
 
     /// Codes `[N', code width]` to wavelet coefficients `[N, coefficients]`.
     #[must_use]
-    pub fn decode(&self, code_NC: Tensor<2>, extent: Extent) -> (Tensor<2>, Extent) {
+    pub fn decode(
+        &self,
+        code_NC: Tensor<2>,
+        extent: Extent,
+        cuts: &mut Cuts,
+    ) -> (Tensor<2>, Extent) {
         let h_NC = self.post_quant_conv.forward(code_NC, extent);
-        self.decoder.forward(h_NC, extent)
+        self.decoder.forward(h_NC, extent, cuts)
+    }
+
+    /// The names of all parameters, about in the order in which backward is done with them.
+    #[must_use]
+    pub fn backward_order(&self) -> Vec<String> {
+        let up = (0..self.decoder.up.len()).rev();
+        let up: Vec<String> = up.map(|level| format!("decoder.up.{level}.")).collect();
+        let start = ["encoder.", "quant_conv.", "post_quant_conv.", "decoder."];
+        let end = ["decoder.norm_out.", "decoder.conv_out."];
+        let up = up.iter().map(String::as_str);
+        let stages: Vec<&str> = start.into_iter().chain(up).chain(end).collect();
+        backward_order(self, &stages)
     }
 }
 

@@ -10,6 +10,7 @@ use super::padding::Padding;
 use super::settings::COLOURS;
 use super::{Fsq, Network, VideoSettings, haar};
 use crate::clip::Signal;
+use crate::engine::Cuts;
 use crate::engine::parameters::to_host;
 use crate::tokenizer::normaliser::Normaliser;
 use crate::tokenizer::trained::FILE;
@@ -165,28 +166,31 @@ impl VideoTokenizer {
     }
 
     /// Latents `[N', code width]` before quantisation.
-    pub(super) fn latents(&self, blocks: Tensor<2>, samples: usize) -> Tensor<2> {
+    pub(super) fn latents(&self, blocks: Tensor<2>, samples: usize, cuts: &mut Cuts) -> Tensor<2> {
         let coefficients = self.maps[0].apply(blocks);
-        self.network.encode(coefficients, self.extent(samples)).0
+        let extent = self.extent(samples);
+        self.network.encode(coefficients, extent, cuts).0
     }
 
     /// Blocks of pixels `[N, patch^3 * 3]` of codes `[N', code width]`.
-    fn pixels(&self, codes: Tensor<2>, samples: usize) -> Tensor<2> {
-        let (coefficients, _) = self.network.decode(codes, self.token_extent(samples));
+    fn pixels(&self, codes: Tensor<2>, samples: usize, cuts: &mut Cuts) -> Tensor<2> {
+        let extent = self.token_extent(samples);
+        let (coefficients, _) = self.network.decode(codes, extent, cuts);
         self.maps[1].apply(coefficients)
     }
 
     /// The forward pass of one training step over clips `[frames, height, width, 3]`, gradients passing straight through the
-    /// rounding.
+    /// rounding. Backward can go block by block.
     ///
     /// # Errors
     /// When a clip has another size or holds a value that is not finite.
-    pub fn train(&self, clips: &[Signal]) -> Result<Trained, TokenizerError> {
+    pub fn train(&self, clips: &[Signal], cuts: &mut Cuts) -> Result<Trained, TokenizerError> {
         let values = self.checked(clips)?;
         let samples = clips.len();
         let slices: Vec<&[f32]> = values.iter().map(Vec::as_slice).collect();
         let blocks = self.blocks(&slices);
-        let latents = self.latents(blocks.clone(), samples);
+        let latents = self.latents(blocks.clone(), samples, cuts);
+        let latents = cuts.at(latents);
         let unevenness = unevenness(latents.clone());
         let bounded = self.bound(latents);
         let host = to_host(bounded.clone());
@@ -199,7 +203,7 @@ impl VideoTokenizer {
         );
         let soft = bounded / self.row(|levels| (levels / 2) as f64);
         let offset: Tensor<2> = codes - soft.clone().without_autodiff();
-        let found = self.pixels(soft + offset, samples);
+        let found = self.pixels(soft + offset, samples, cuts);
         let kept = self.kept(samples);
         let count = kept.clone().sum().into_scalar::<f32>() as f64;
         let loss = ((found - blocks).square() * kept).sum() / count;
@@ -328,9 +332,11 @@ impl Tokenizer for VideoTokenizer {
         Ok(clips
             .iter()
             .map(|clip| TokenGrid {
-                ids: self
-                    .fsq
-                    .encode(&to_host(self.latents(self.blocks(&[clip]), 1))),
+                ids: self.fsq.encode(&to_host(self.latents(
+                    self.blocks(&[clip]),
+                    1,
+                    &mut Cuts::none(),
+                ))),
                 grid: self.grid.clone(),
             })
             .collect())
@@ -345,7 +351,7 @@ impl Tokenizer for VideoTokenizer {
                 let codes = self.fsq.decode(&grid.ids);
                 let shape = [grid.ids.len(), self.fsq.width()];
                 let codes = Tensor::from_data(TensorData::new(codes, shape), &device);
-                let blocks = to_host(self.pixels(codes, 1));
+                let blocks = to_host(self.pixels(codes, 1, &mut Cuts::none()));
                 let padded = haar::paste(&blocks, self.size(), [self.settings().patch; 2]);
                 let mut values = self.padding.crop(&padded, COLOURS);
                 for value in &mut values {
@@ -438,7 +444,9 @@ mod tests {
             let mut optimizer = AdamW::new(AdamWSettings::default(), tokenizer.network());
             let mut losses = Vec::new();
             for _ in 0..12 {
-                let trained = tokenizer.train(&[clip(0), clip(2)]).unwrap();
+                let trained = tokenizer
+                    .train(&[clip(0), clip(2)], &mut Cuts::none())
+                    .unwrap();
                 losses.push(trained.loss.clone().into_scalar::<f32>());
                 let gradients = Gradients::of(&trained.loss, tokenizer.network());
                 optimizer

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use burn::tensor::Tensor;
+use burn::tensor::{Gradients as Tape, Tensor};
 
 use super::ops::Norm;
 use super::parameters::{Parameters, join};
@@ -41,11 +41,19 @@ impl Gradients {
         inputs: [&Tensor<2>; N],
     ) -> [Tensor<2>; N] {
         let mut tape = loss.backward();
+        self.collect(&mut tape, model);
+        inputs.map(|input| {
+            let gradient = input.grad_remove(&mut tape);
+            gradient.unwrap_or_else(|| input.clone().without_autodiff().zeros_like())
+        })
+    }
+
+    fn collect<M: Parameters + ?Sized>(&mut self, tape: &mut Tape, model: &M) {
         model.visit("", &mut |name, parameter| {
             if !parameter.is_tracked() {
                 return;
             }
-            let Some(more) = parameter.flat().grad_remove(&mut tape) else {
+            let Some(more) = parameter.flat().grad_remove(tape) else {
                 return;
             };
             match self.by_name.get_mut(name) {
@@ -55,10 +63,33 @@ impl Gradients {
                 }
             }
         });
-        inputs.map(|input| {
-            let gradient = input.grad_remove(&mut tape);
-            gradient.unwrap_or_else(|| input.clone().without_autodiff().zeros_like())
-        })
+    }
+
+    /// As [`Gradients::add`] for a part of a graph whose parameters no other part has: `complete` hears of their gradients. There is
+    /// nothing for `inputs` that the part does not depend on.
+    ///
+    /// # Panics
+    /// When another part has one of them, or `loss` does not depend on anything tracked.
+    pub fn add_part<M: Parameters + ?Sized>(
+        &mut self,
+        loss: &Tensor<1>,
+        model: &M,
+        inputs: &[Tensor<2>],
+        complete: &mut Complete<'_>,
+    ) -> Vec<Option<Tensor<2>>> {
+        let mut tape = loss.backward();
+        let mut part = Self::default();
+        part.collect(&mut tape, model);
+        for (name, gradient) in part.by_name {
+            assert!(
+                !self.by_name.contains_key(&name),
+                "parameter `{name}` is in two parts of the graph"
+            );
+            complete(&name, &gradient);
+            self.by_name.insert(name, gradient);
+        }
+        let inputs = inputs.iter();
+        inputs.map(|input| input.grad_remove(&mut tape)).collect()
     }
 
     /// Gives every tracked parameter of `model` that has no gradient yet one of zeros.

@@ -11,11 +11,13 @@
 //!   video. On the CPU each is one fused operation with a hand-written backward; on other back ends it is unfused of the
 //!   library's own operations. Nearest code is a search on the host; embedding is the library's select everywhere;
 //! * [`gradients`]: gradients by parameter name, their global norm, and who hears of them while backward goes on;
+//! * [`cuts`]: a graph that is cut, so that backward goes part by part;
 //! * [`communicator`]: processes that train one model together;
 //! * [`memory`]: an allocator that uses the memory of one step again in the next.
 
 pub mod communicator;
 pub mod compute;
+pub mod cuts;
 pub mod gradients;
 pub mod initialise;
 pub mod memory;
@@ -27,6 +29,7 @@ pub mod weights;
 pub use burn::tensor::{Bool, Device, Int, Tensor};
 pub use communicator::{Communicator, RankError};
 pub use compute::{Compute, DeviceChoice, DeviceKind, Precision};
+pub use cuts::Cuts;
 pub use gradients::{Complete, Gradients};
 pub use initialise::Initialise;
 pub use parameters::{Parameter, Parameters, parameters};

@@ -3,15 +3,18 @@
 //! [`Communicator`] is what the rooms above see: alone, ranks that are threads of this process (what tests train with), or MPI
 //! processes (feature `mpi`). Read in this order: this file; [`launch`], who started us and as what; [`reduce`], how gradients
 //! are added up; [`shard`], who keeps which part of the optimizer's state; [`watch`], how a rank that is lost is found; `threads` and
-//! `mpi`, the two ways to carry bytes.
+//! `mpi`, the two ways to carry bytes; [`devices`] and `nccl`, how GPUs of NVIDIA add up gradients among themselves.
 //!
 //! Nothing is left to the library that carries the bytes: gradients are added here, in the order of ranks, so that what comes out
 //! does not depend on an implementation of MPI or on the algorithm it picks (measured: six algorithms of OpenMPI give three
-//! results for three ranks).
+//! results for three ranks). NCCL is the exception: it adds up itself, and is not asked where an order is promised.
 
+pub mod devices;
 pub mod launch;
 #[cfg(feature = "mpi")]
 mod mpi;
+#[cfg(feature = "cuda")]
+mod nccl;
 pub mod reduce;
 pub mod shard;
 mod threads;
@@ -57,6 +60,8 @@ pub(crate) trait Link: Send + Sync {
     fn exchange(&self, values: Vec<f32>) -> Pending<Vec<f32>>;
     /// The equally long values of every rank, one after the other, by rank.
     fn collect(&self, values: Vec<f32>) -> Pending<Vec<f32>>;
+    /// This rank is where all ranks meet, by another way than this one.
+    fn meet(&self) {}
     /// Whether this rank is in a step, where the others may not wait for it for long.
     fn stepping(&self, _: bool) {}
     /// Ends the connection, when all others do.
@@ -95,6 +100,8 @@ impl<T> Pending<T> {
 #[derive(Clone, Default)]
 pub struct Communicator {
     link: Option<Arc<dyn Link>>,
+    /// What adds up arrays without the host, where there is such a thing.
+    devices: Option<Arc<dyn devices::DeviceLink>>,
     /// A failure that every rank has heard of, and that [`Communicator::settle`] has not cleared yet.
     failed: Arc<AtomicBool>,
 }
@@ -154,6 +161,7 @@ impl Communicator {
     fn of(link: Arc<dyn Link>) -> Self {
         Self {
             link: Some(link),
+            devices: None,
             failed: Arc::default(),
         }
     }

@@ -32,6 +32,7 @@ enum Order {
     Gather(Vec<u8>, Answer<Vec<Vec<u8>>>),
     Exchange(Vec<f32>, Answer<Vec<f32>>),
     Collect(Vec<f32>, Answer<Vec<f32>>),
+    Meet,
     Finish(Answer<()>),
     Abort(i32),
 }
@@ -44,7 +45,7 @@ impl Order {
             Self::Gather(_, answer) => answer.send(Err(error)).is_ok(),
             Self::Exchange(_, answer) | Self::Collect(_, answer) => answer.send(Err(error)).is_ok(),
             Self::Finish(answer) => answer.send(Err(error)).is_ok(),
-            Self::Abort(_) => true,
+            Self::Meet | Self::Abort(_) => true,
         };
     }
 }
@@ -127,6 +128,12 @@ impl Link for Mpi {
         self.order(|answer| Order::Collect(values, answer))
     }
 
+    fn meet(&self) {
+        let orders = self.orders.lock().unwrap_or_else(PoisonError::into_inner);
+        // Where the thread has ended, the next wait says so.
+        let _ = orders.send(Order::Meet);
+    }
+
     fn stepping(&self, yes: bool) {
         self.stepping.store(yes, Ordering::Relaxed);
     }
@@ -196,6 +203,7 @@ impl Thread {
                 Ok(Order::Gather(bytes, answer)) => self.gather(bytes, answer),
                 Ok(Order::Exchange(values, answer)) => self.exchange(&values, &answer),
                 Ok(Order::Collect(values, answer)) => self.collect(&values, &answer),
+                Ok(Order::Meet) => self.met += 1,
                 Ok(Order::Abort(code)) => SimpleCommunicator::world().abort(code),
                 Ok(Order::Finish(answer)) => {
                     let barrier = SimpleCommunicator::world().immediate_barrier();

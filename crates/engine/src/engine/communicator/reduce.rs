@@ -6,10 +6,13 @@
 //! that it is on its way while backward fills the next.
 //!
 //! Which values a bucket has and when it is sent changes no bit of a sum: a number is added in the order of ranks wherever it lies.
+//!
+//! Where devices add up arrays among themselves ([`super::devices`]), a bucket stays on them; their library chooses the order.
 
+use super::devices::DeviceLink;
 use super::{Communicator, Link, RankError};
 use crate::engine::{Gradients, Parameters, parameters::to_host};
-use burn::tensor::{Tensor, TensorData};
+use burn::tensor::{Device, Tensor, TensorData};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -17,8 +20,17 @@ use std::sync::Arc;
 use std::sync::mpsc::{Receiver, Sender, channel};
 use std::thread::JoinHandle;
 
-/// Values on the wire at a time: 25 MiB, as PyTorch's buckets are.
+/// Values on the wire at a time, at most: 25 MiB, as PyTorch's buckets are.
 pub(super) const BUCKET: usize = 25 * (1 << 20) / 4;
+
+/// Values that a rank sends to another at a time, at least: 1 MiB, which takes much longer than its message is late. Of few ranks
+/// buckets are smaller for it: they are added while they are in the cache, and less is left to do when backward ends.
+const PART: usize = (1 << 20) / 4;
+
+/// Values of a bucket of so many ranks.
+fn bucket(ranks: usize) -> usize {
+    BUCKET.min(ranks * PART)
+}
 
 /// In which order gradients of micro-batches are added over ranks. One rank always adds them in the order of samples.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
@@ -43,7 +55,7 @@ pub struct Sum {
     full: Sender<Vec<Piece>>,
     ended: Receiver<()>,
     /// `None` once it was heard.
-    worker: Option<JoinHandle<Result<Vec<Vec<f32>>, RankError>>>,
+    worker: Option<JoinHandle<Result<Vec<Tensor<1>>, RankError>>>,
 }
 
 /// Where the gradient of a parameter travels.
@@ -86,6 +98,16 @@ impl Piece {
     }
 }
 
+/// The values of a bucket, on their device.
+fn joined(mut pieces: Vec<Piece>, device: &Device) -> Tensor<1> {
+    pieces.sort_unstable_by_key(|piece| piece.start);
+    let sums = pieces.iter().map(|piece| {
+        let sum = piece.sum();
+        sum.unwrap_or_else(|| Tensor::full([piece.length], -0.0, device))
+    });
+    Tensor::cat(sums.collect(), 0)
+}
+
 /// The values of a bucket, on the host.
 fn packed(mut pieces: Vec<Piece>) -> Vec<f32> {
     pieces.sort_unstable_by_key(|piece| piece.start);
@@ -116,7 +138,11 @@ impl Sum {
         order: &[String],
         rounds: usize,
     ) -> Option<Self> {
-        Self::in_buckets(ranks, model, order, rounds, BUCKET)
+        let most = match ranks.devices {
+            Some(_) => BUCKET,
+            None => bucket(ranks.size()),
+        };
+        Self::in_buckets(ranks, model, order, rounds, most)
     }
 
     fn in_buckets<M: Parameters + ?Sized>(
@@ -128,9 +154,11 @@ impl Sum {
     ) -> Option<Self> {
         let link = Arc::clone(ranks.link.as_ref()?);
         let mut lengths = BTreeMap::new();
+        let mut device = None;
         model.visit("", &mut |name, parameter| {
             if parameter.is_tracked() {
                 lengths.insert(name.to_owned(), parameter.len());
+                device.get_or_insert_with(|| parameter.untracked().device());
             }
         });
         let mut buckets: Vec<Bucket> = Vec::new();
@@ -158,7 +186,16 @@ impl Sum {
         let lengths = buckets.iter().map(|bucket| bucket.length).collect();
         let (sender, received) = channel();
         let (end, ended) = channel();
-        let work = move || Worker::new(link, lengths, end).run(rounds, &received);
+        // Several rounds are there for an order, which is ours to keep.
+        let devices = ranks.devices.clone().filter(|_| rounds == 1);
+        let device = device.unwrap_or_default();
+        let work = move || {
+            let worker = Worker::new(link, lengths, device, end);
+            match devices {
+                Some(devices) => worker.run_on(devices.as_ref(), &received),
+                None => worker.run(rounds, &received),
+            }
+        };
         Some(Self {
             places,
             buckets,
@@ -224,19 +261,18 @@ impl Sum {
     pub fn finish<M: Parameters + ?Sized>(mut self, model: &M) -> Result<Gradients, RankError> {
         let all = self.join()?;
         let mut gradients = BTreeMap::new();
-        model.visit("", &mut |name, parameter| {
+        model.visit("", &mut |name, _| {
             if let Some(place) = self.places.get(name) {
-                let values = all[place.bucket][place.start..][..place.length].to_vec();
-                let data = TensorData::new(values, [place.length]);
-                let tensor = Tensor::from_data(data, &parameter.untracked().device());
-                gradients.insert(name.to_owned(), tensor);
+                let sum = all[place.bucket].clone();
+                let sum = sum.slice([place.start..place.start + place.length]);
+                gradients.insert(name.to_owned(), sum);
             }
         });
         Ok(Gradients::from_map(gradients))
     }
 
     /// What the worker leaves.
-    fn join(&mut self) -> Result<Vec<Vec<f32>>, RankError> {
+    fn join(&mut self) -> Result<Vec<Tensor<1>>, RankError> {
         match self.worker.take().map(JoinHandle::join) {
             Some(Ok(sums)) => sums,
             // What the tensor library panics with is said on this thread, as without a worker.
@@ -260,17 +296,20 @@ struct Worker {
     link: Arc<dyn Link>,
     /// Values of each bucket.
     lengths: Vec<usize>,
+    /// Where gradients are.
+    device: Device,
     /// This rank's parts of the sums so far.
     parts: Vec<Vec<f32>>,
     ended: Sender<()>,
 }
 
 impl Worker {
-    fn new(link: Arc<dyn Link>, lengths: Vec<usize>, ended: Sender<()>) -> Self {
+    fn new(link: Arc<dyn Link>, lengths: Vec<usize>, device: Device, ended: Sender<()>) -> Self {
         Self {
             link,
             parts: vec![Vec::new(); lengths.len()],
             lengths,
+            device,
             ended,
         }
     }
@@ -280,7 +319,7 @@ impl Worker {
         mut self,
         rounds: usize,
         buckets: &Receiver<Vec<Piece>>,
-    ) -> Result<Vec<Vec<f32>>, RankError> {
+    ) -> Result<Vec<Tensor<1>>, RankError> {
         let size = self.link.size();
         let mut collecting = Vec::new();
         for round in 1..=rounds {
@@ -312,7 +351,35 @@ impl Worker {
                 return Ok(Vec::new());
             }
         }
-        collecting.into_iter().map(super::Pending::wait).collect()
+        let sums = collecting.into_iter();
+        let sums = sums.map(|sum| {
+            let values = sum.wait()?;
+            let length = values.len();
+            let data = TensorData::new(values, [length]);
+            Ok(Tensor::from_data(data, &self.device))
+        });
+        sums.collect()
+    }
+
+    /// The sums of all buckets of one round, which never leave their devices.
+    fn run_on(
+        self,
+        devices: &dyn DeviceLink,
+        buckets: &Receiver<Vec<Piece>>,
+    ) -> Result<Vec<Tensor<1>>, RankError> {
+        let mut sums = Vec::new();
+        for _ in &self.lengths {
+            let Ok(pieces) = buckets.recv() else {
+                return Ok(Vec::new());
+            };
+            let values = joined(pieces, &self.device);
+            // The library of the devices waits for a rank that hangs for ever; so it is seen that this one does not.
+            self.link.meet();
+            sums.push(devices.sum(values)?);
+        }
+        // Where the round is over for this rank, nobody listens.
+        let _ = self.ended.send(());
+        Ok(sums)
     }
 
     /// Adds what the ranks have for this one, in their order.
@@ -452,5 +519,51 @@ mod tests {
                 .to_string()
         });
         assert_eq!(found[0], "rank 1 of 2: it has left");
+    }
+
+    /// Adds up as a library of devices would, over the link of the ranks.
+    struct OverLink(Arc<dyn Link>);
+
+    impl DeviceLink for OverLink {
+        fn sum(&self, values: Tensor<1>) -> Result<Tensor<1>, RankError> {
+            let (device, length) = (values.device(), values.dims()[0]);
+            let all = self.0.collect(to_host(values)).wait()?;
+            let parts = all
+                .chunks_exact(length)
+                .map(|part| Tensor::from_data(TensorData::new(part.to_vec(), [length]), &device));
+            Ok(parts.reduce(|sum: Tensor<1>, more| sum + more).unwrap())
+        }
+    }
+
+    #[test]
+    fn buckets_that_stay_on_devices_have_the_sums_of_those_that_travel_and_an_order_is_kept_on_the_host()
+     {
+        for rounds in [1, 2] {
+            let found = on_ranks(3, |ranks| {
+                let model = model();
+                let order = ["bias", "weight"].map(str::to_owned);
+                let sum = |ranks: &Communicator| {
+                    let mut sum = Sum::in_buckets(ranks, &model, &order, rounds, 4).unwrap();
+                    for round in 0..rounds {
+                        // Rank 1 has nothing in the first round, and nothing for the bias before.
+                        let last = gradient(&model, ranks.rank() + 4 * round);
+                        sum.put("bias", None, last.as_ref().and_then(|all| all.get("bias")));
+                        let earlier = gradient(&model, ranks.rank() + 8);
+                        sum.end_round(earlier.as_ref(), last.as_ref()).unwrap();
+                    }
+                    bits(&sum.finish(&model).unwrap())
+                };
+                let host = sum(&ranks);
+                let link = ranks.link.clone().unwrap();
+                let ranks = Communicator {
+                    devices: Some(Arc::new(OverLink(link))),
+                    ..ranks
+                };
+                (host, sum(&ranks))
+            });
+            for (host, devices) in found {
+                assert_eq!(host, devices, "{rounds} rounds");
+            }
+        }
     }
 }

@@ -18,6 +18,18 @@ pub(super) fn host(tensor: Tensor<1>) -> FlexTensor {
         .to_contiguous()
 }
 
+/// An array to be read; it may be a part of another.
+fn read(tensor: Tensor<1>) -> Array {
+    let tensor = tensor
+        .try_into_primitive::<Flex>()
+        .expect("the front door lets only arrays of the CPU in");
+    if tensor.is_contiguous() {
+        Array(tensor)
+    } else {
+        Array::dense(&tensor)
+    }
+}
+
 /// One AdamW step in one pass; in place where the arrays are not shared.
 pub fn adamw(
     values: Tensor<1>,
@@ -28,7 +40,7 @@ pub fn adamw(
     step: AdamWStep,
 ) -> (Tensor<1>, Tensor<1>, Tensor<1>) {
     let [mut values, mut mean, mut square] = [values, mean, square].map(host);
-    let gradient = Array::dense(&host(gradient));
+    let gradient = read(gradient);
     let [beta1, beta2] = step.betas.map(|beta| beta as f32);
     let [learn1, learn2] = step.betas.map(|beta| (1.0 - beta) as f32);
     let (scale, epsilon, keep) = (scale as f32, step.epsilon as f32, (1.0 - step.decay) as f32);
@@ -62,7 +74,7 @@ pub fn adamw(
 
 /// The sum of squares: in f32 within tasks, in f64 over them.
 pub fn sum_of_squares(x: Tensor<1>) -> f64 {
-    let x = Array::dense(&host(x));
+    let x = read(x);
     let partial: Vec<f64> = x
         .values()
         .par_chunks(ELEMENTS)
