@@ -40,9 +40,13 @@ if [ -n "$vectors" ] && [ ! -d "$vectors" ]; then
     exit 2
 fi
 
-cases=(mget-tiny mget-base tokenizer video depth-short decoding-fast)
+cases=(product mget-tiny mget-base tokenizer video depth-short decoding-fast)
+rounded=(product mget-tiny mget-base decoding-fast)
+compiled=(mget-tiny mget-base)
 if [ -n "$short" ]; then
     cases=(decoding-fast)
+    rounded=(decoding-fast)
+    compiled=()
     rounds=1
 fi
 work=$(mktemp -d)
@@ -68,37 +72,67 @@ cargo bench --features "$features" "${config[@]}" --bench speed --no-run
 } >"$page"
 
 status=0
+# PRECISION FOLDER [OPTION]: holds what the reference says, or not, or the device cannot.
+parity() {
+    local precision=$1 folder=$2 rc=0
+    shift 2
+    cargo run "${built[@]}" --example check_parity -- "$folder" --device "$device" "$@" \
+        >"$work/parity.txt" 2>"$work/parity.err" || rc=$?
+    case $rc in
+        0) echo "Parity in $precision holds; the worst tensors:" ;;
+        1)
+            echo "Parity in $precision **does not hold**; the worst tensors:"
+            status=1
+            ;;
+        *)
+            echo "Parity in $precision was not checked: $(tail -n 1 "$work/parity.err")"
+            [ "$precision" = bf16 ] || status=1
+            echo
+            return
+            ;;
+    esac
+    echo
+    echo '```'
+    head -n 1 "$work/parity.txt"
+    tail -n 12 "$work/parity.txt"
+    echo '```'
+    echo
+}
+
 if [ -n "$vectors" ]; then
-    # Tolerances are those of the files, for f32.
-    if cargo run "${built[@]}" --example check_parity -- "$vectors" --device "$device" >"$work/parity.txt" 2>"$work/parity.err"; then
-        verdict=holds
-    else
-        verdict='**does not hold**'
-        status=1
+    # Tolerances are those of the files in f32, and at least 2e-2 in bf16.
+    parity f32 "$vectors" >>"$page"
+    if [ -d "$vectors/mget" ]; then
+        parity bf16 "$vectors/mget" --bf16 >>"$page"
     fi
-    {
-        echo "Parity in f32 $verdict; the worst tensors:"
-        echo
-        echo '```'
-        head -n 1 "$work/parity.txt"
-        tail -n 12 "$work/parity.txt"
-        [ "$status" = 0 ] || tail -n 3 "$work/parity.err"
-        echo '```'
-    } >>"$page"
 else
     echo "Not checked: no \`--vectors\` were given." >>"$page"
 fi
 
-arguments=(--device "$device" --rounds "$rounds" --write "$work/speed.md")
-[ -z "$python" ] || arguments+=(--python "$python")
-cargo bench --features "$features" "${config[@]}" --bench speed -- "${arguments[@]}" "${cases[@]}" >/dev/null
-{
+# HEADING OPTION... -- CASE...: what is measured, and the tokens per second of its trainings.
+speed() {
+    local heading=$1 options=()
+    shift
+    while [ "$1" != -- ]; do
+        options+=("$1")
+        shift
+    done
+    shift
+    echo "measuring: $heading" >&2
+    [ -z "$python" ] || options+=(--python "$python")
+    options+=(--device "$device" --rounds "$rounds" --write "$work/speed.md")
+    rm -f "$work/speed.md"
+    cargo bench --features "$features" "${config[@]}" --bench speed -- "${options[@]}" "$@" >/dev/null 2>"$work/speed.err" || true
     echo
-    sed 's/^# Speed/## Speed/' "$work/speed.md"
+    echo "## $heading"
     echo
-    echo "## Tokens per second of training"
+    if [ ! -f "$work/speed.md" ]; then
+        echo "Not measured: $(tail -n 1 "$work/speed.err")"
+        return
+    fi
+    sed '1,2d' "$work/speed.md"
     echo
-    echo "| model | reviv | PyTorch |"
+    echo "| training, tokens per second | reviv | PyTorch |"
     echo "|---|--:|--:|"
     # | MGET `tiny` (8 samples, 256 + 256 tokens): train step | 0.123 s (...) | 0.234 s (...) | ...
     awk -F '|' '
@@ -114,7 +148,14 @@ cargo bench --features "$features" "${config[@]}" --bench speed -- "${arguments[
             sub(/: train step */, "", name)
             printf "|%s | %s | %s |\n", name, rate($3, tokens), rate($4, tokens)
         }' "$work/speed.md"
-} >>"$page"
+}
+
+speed "Speed in f32" -- "${cases[@]}" >>"$page"
+grep -q '^Not measured' "$page" && status=1
+speed "Speed with products in bf16" --bf16 -- "${rounded[@]}" >>"$page"
+if [ -n "$python" ] && [ ${#compiled[@]} -gt 0 ]; then
+    speed "Beside a compiled PyTorch, in bf16" --bf16 --compile -- "${compiled[@]}" >>"$page"
+fi
 
 mkdir -p "$(dirname "$write")"
 cp "$page" "$write"

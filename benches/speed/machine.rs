@@ -1,5 +1,6 @@
 //! What the numbers were measured on and with: the paragraph above the table.
 
+use crate::Arguments;
 use crate::peer::Engine;
 use crate::table::Results;
 use reviv::run::environment::{Environment, now_text};
@@ -8,7 +9,8 @@ use std::path::Path;
 use std::process::Command;
 
 /// The header of the report.
-pub fn header(threads: usize, rounds: usize, all: &[Results], compared: bool) -> String {
+pub fn header(arguments: &Arguments, threads: usize, all: &[Results]) -> String {
+    let compared = arguments.python.is_some();
     let environment = Environment::look(Path::new(env!("CARGO_MANIFEST_DIR")));
     let memory = environment
         .memory_bytes
@@ -32,21 +34,31 @@ pub fn header(threads: usize, rounds: usize, all: &[Results], compared: bool) ->
         .iter()
         .find_map(|results| results.theirs.as_ref()?.engine.clone())
     {
-        let _ = write!(with, "; PyTorch {version}, eager, {threads} threads");
+        let how = if arguments.compile {
+            "MGET compiled"
+        } else {
+            "eager"
+        };
+        let _ = write!(with, "; PyTorch {version}, {how}, {threads} threads");
     }
     let ratio = if compared {
         " The ratio is that of the medians: above 1, reviv is faster."
     } else {
         ""
     };
-    let rounds = match rounds {
+    let precision = if arguments.bf16 {
+        "f32 with MGET's products in bfloat16"
+    } else {
+        "f32"
+    };
+    let rounds = match arguments.rounds.get() {
         1 => "one round".to_owned(),
         rounds => format!("{rounds} rounds"),
     };
     format!(
         "# Speed\n\n\
          {}, {threads} of {} cores used{memory}; {system}. {with}. {}.\n\n\
-         Seconds are the median and (least..most) of {rounds}, in f32 on {}, each in a fresh process after one \
+         Seconds are the median and (least..most) of {rounds}, in {precision} on {}, each in a fresh process after one \
          call to warm up.{ratio} Memory is the peak of the process; page faults are the most of any call after the second.\n",
         environment.cpu,
         environment.cores,

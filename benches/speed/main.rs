@@ -1,11 +1,11 @@
 //! How fast reviv is, beside PyTorch on the same machine in the same run.
 //!
-//! `cargo bench --bench speed -- --python PATH [--device cuda] [--threads N] [--rounds N] [--write FILE] [CASE...]`
+//! `cargo bench --bench speed -- --python PATH [--device cuda] [--bf16] [--compile] [--threads N] [--rounds N] [--write FILE] [CASE...]`
 //!
 //! PATH is a Python that has PyTorch; without it reviv is measured alone. The two sides take turns, round by round, each in a
 //! process of its own with as many threads and one call to warm up, so both see the same machine and neither the other's
 //! memory. In this order: [`peer`] (asks a side), [`measure`] (what our side does when asked), the cases [`tokenizer`],
-//! [`video`], [`depth`], [`mget`] and [`decoding`], and [`table`] with [`machine`] (the answer). `peer/` is PyTorch's side.
+//! [`video`], [`depth`], [`mget`], [`decoding`] and [`product`], and [`table`] with [`machine`] (the answer). `peer/` is PyTorch's side.
 
 mod decoding;
 mod depth;
@@ -13,6 +13,7 @@ mod machine;
 mod measure;
 mod mget;
 mod peer;
+mod product;
 mod table;
 mod tokenizer;
 mod video;
@@ -54,6 +55,12 @@ struct Arguments {
     /// Where reviv computes: auto, cpu, cuda, vulkan, metal or wgpu, a GPU also with its number: `cuda:1`.
     #[arg(long, value_name = "DEVICE", default_value = "cpu")]
     device: DeviceChoice,
+    /// Round the operands of MGET's products to bfloat16; PyTorch does so with everything that its autocast takes.
+    #[arg(long)]
+    bf16: bool,
+    /// Let PyTorch compile its MGET.
+    #[arg(long)]
+    compile: bool,
     /// How often each side has its turn.
     #[arg(long, value_name = "N", default_value = "3")]
     rounds: NonZeroUsize,
@@ -91,6 +98,8 @@ enum Case {
     DecodingFast,
     /// Generation with the preset `release`.
     DecodingRelease,
+    /// One large product of matrices: what the device has at its best. Before MGET, whose share of it is said.
+    Product,
 }
 
 impl Case {
@@ -115,6 +124,7 @@ impl Case {
             Self::DecodingRelease => {
                 "decoding `release` (1 clip: camera, gaze, body from video tokens)"
             }
+            Self::Product => "product (4096 x 4096 x 4096)",
         }
     }
 
@@ -122,7 +132,7 @@ impl Case {
     fn repeats(self) -> usize {
         match self {
             Self::MgetTiny => 5,
-            Self::Tokenizer | Self::Packing | Self::DecodingFast => 3,
+            Self::Tokenizer | Self::Packing | Self::DecodingFast | Self::Product => 3,
             Self::Video | Self::MgetBase | Self::ActivationCheckpointing => 2,
             Self::DepthShort | Self::Depth | Self::DecodingRelease => 1,
         }
@@ -146,6 +156,7 @@ impl Case {
             Self::ActivationCheckpointing => mget::activation_checkpointing(meter),
             Self::DecodingFast => decoding::run(meter, decoding::FAST),
             Self::DecodingRelease => decoding::run(meter, decoding::RELEASE),
+            Self::Product => product::run(meter),
         }
     }
 }
@@ -156,7 +167,12 @@ fn main() -> ExitCode {
         || std::thread::available_parallelism().map_or(1, usize::from),
         usize::from,
     );
-    match Compute::new(arguments.device, Precision::F32) {
+    let precision = if arguments.bf16 {
+        Precision::Bf16
+    } else {
+        Precision::F32
+    };
+    match Compute::new(arguments.device, precision) {
         Ok(compute) => {
             let _ = DEVICE.set(compute);
         }
@@ -214,6 +230,8 @@ fn compare(arguments: &Arguments, threads: usize) -> String {
             repeats: case.repeats(),
             threads,
             device: arguments.device,
+            bf16: arguments.bf16,
+            compile: arguments.compile,
         };
         for round in 1..=rounds {
             eprintln!("{}, round {round} of {rounds}", question.case);
@@ -224,6 +242,6 @@ fn compare(arguments: &Arguments, threads: usize) -> String {
         }
         all.push(results);
     }
-    let header = machine::header(threads, rounds, &all, theirs.is_some());
+    let header = machine::header(arguments, threads, &all);
     format!("{header}\n{}", table::table(&all, theirs.is_some()))
 }

@@ -15,7 +15,12 @@ impl Meter {
     }
 
     /// Measures `work`, after one call that is not counted.
-    pub fn measure(&self, name: &str, mut work: impl FnMut()) {
+    pub fn measure(&self, name: &str, work: impl FnMut()) {
+        self.measure_flop(name, None, work);
+    }
+
+    /// The same of work whose operations were counted.
+    pub fn measure_flop(&self, name: &str, flop: Option<f64>, mut work: impl FnMut()) {
         reset_peak();
         work();
         let mut faulted = Vec::new();
@@ -31,6 +36,7 @@ impl Meter {
         say(&Line::Measured(Measured {
             name: name.to_owned(),
             seconds,
+            flop,
             memory_mib: device_memory().or_else(peak),
             // The call to warm up is the first.
             faults: faulted.into_iter().skip(1).flatten().max(),

@@ -98,13 +98,31 @@ fn batch(spec: &MgetSpec, masks: &[Mask]) -> Batch {
 fn measure_step(meter: &Meter, name: &str, mut model: Mget, batch: &Batch) {
     model.start_training();
     let mut optimizer = AdamW::new(AdamWSettings::default(), &model);
-    meter.measure(name, || {
+    meter.measure_flop(name, flop(&model, batch), || {
         let losses = model.losses(batch, Loss::Mod);
         let gradients = Gradients::of(&losses.total.expect("something is asked for"), &model);
         optimizer
             .step(&mut model, gradients, 1e-4)
             .expect("the gradients are finite");
     });
+}
+
+/// Operations of a step over samples that are all alike: backward costs twice the forward, a multiply-accumulate is two.
+fn flop(model: &Mget, batch: &Batch) -> Option<f64> {
+    let [given, asked] = [&batch.visible.sequence, &batch.targets.sequence];
+    let alike = |lengths: &[usize]| lengths.windows(2).all(|pair| pair[0] == pair[1]);
+    if !alike(&given.lengths) || !alike(&asked.lengths) {
+        return None;
+    }
+    let samples = given.lengths.len();
+    let targets: Vec<usize> = batch
+        .targets
+        .ids
+        .iter()
+        .map(|ids| ids.len() / samples)
+        .collect();
+    let forward = (model.spec()).multiply_accumulates(*given.lengths.first()?, &targets);
+    Some(6.0 * forward * samples as f64)
 }
 
 /// `samples` samples of `tokens` given and as many asked tokens.

@@ -29,6 +29,9 @@ pub struct Measured {
     pub name: String,
     /// One per repetition.
     pub seconds: Vec<f64>,
+    /// Operations of products in one of them; `None` where nobody has counted.
+    #[serde(default)]
+    pub flop: Option<f64>,
     /// Peak of resident memory while it ran; `None` where the system does not tell.
     pub memory_mib: Option<f64>,
     /// The most minor page faults of a call after the second; `None` where the side or the system does not tell.
@@ -52,6 +55,10 @@ pub struct Question {
     pub repeats: usize,
     pub threads: usize,
     pub device: DeviceChoice,
+    /// Products of bfloat16.
+    pub bf16: bool,
+    /// PyTorch's MGET is compiled.
+    pub compile: bool,
 }
 
 impl Side {
@@ -61,6 +68,8 @@ impl Side {
             repeats,
             threads,
             device,
+            bf16,
+            compile,
         } = question;
         let (repeats, threads) = (repeats.to_string(), threads.to_string());
         let device = device.to_string();
@@ -68,6 +77,7 @@ impl Side {
             Self::Reviv => Command::new(std::env::current_exe()?)
                 .args([case, "--repeats", &repeats, "--threads", &threads])
                 .args(["--device", &device])
+                .args(bf16.then_some("--bf16"))
                 .output(),
             Self::PyTorch { python } => {
                 let package = Path::new(env!("CARGO_MANIFEST_DIR")).join("benches/speed/peer");
@@ -76,6 +86,8 @@ impl Side {
                     .arg("-B")
                     .arg(package)
                     .args([case, &repeats, &threads, &device])
+                    .args(bf16.then_some("bf16"))
+                    .args(compile.then_some("compile"))
                     .output()
             }
         }

@@ -125,10 +125,37 @@ pub fn table(all: &[Results], compared: bool) -> String {
             );
         }
     }
+    for sentence in shares(all) {
+        let _ = writeln!(text, "\n{sentence}");
+    }
     if let Some(sentence) = all.iter().find_map(packing) {
         let _ = writeln!(text, "\n{sentence}");
     }
     text
+}
+
+/// The rate of what has its operations counted, and its share of that of the large product, in a sentence each.
+fn shares(all: &[Results]) -> Vec<String> {
+    let rate = |measured: &Measured| Some(measured.flop? / median(&measured.seconds));
+    let product = all.iter().find(|results| results.case == Case::Product);
+    let peak = product.and_then(|results| rate(results.ours.measured.first()?));
+    let counted = all.iter().flat_map(|results| {
+        let measured = results.ours.measured.iter();
+        measured.filter_map(move |measured| Some((results.case, measured, rate(measured)?)))
+    });
+    let sentence = |(case, measured, rate): (Case, &Measured, f64)| {
+        let what = format!(
+            "{}, {}: {:.3} TFLOP/s",
+            case.title(),
+            measured.name,
+            rate / 1e12
+        );
+        match peak.filter(|_| case != Case::Product) {
+            Some(peak) => format!("{what}, {:.0} % of the product.", 100.0 * rate / peak),
+            None => format!("{what}."),
+        }
+    };
+    counted.map(sentence).collect()
 }
 
 /// What packing saves, in a sentence.

@@ -20,7 +20,7 @@ mod vq;
 use std::cell::RefCell;
 use std::path::Path;
 
-use reviv::engine::Compute;
+use reviv::engine::{Compute, Precision};
 
 pub use checks::Outcome;
 use report::Report;
@@ -41,6 +41,9 @@ const FOLDERS: &[(&str, Check)] = &[
     ("vq", vq::check),
 ];
 
+/// What products of bfloat16 may be off.
+const BF16: f64 = 2e-2;
+
 thread_local! {
     /// What computes.
     static DEVICE: RefCell<Compute> = RefCell::new(Compute::cpu());
@@ -49,6 +52,14 @@ thread_local! {
 /// What computes.
 fn compute() -> Compute {
     DEVICE.with_borrow(Clone::clone)
+}
+
+/// How far off a number may be that a file allows `tolerance`.
+fn allowed(tolerance: f64) -> f64 {
+    match compute().precision() {
+        Precision::F32 => tolerance,
+        Precision::Bf16 => tolerance.max(BF16),
+    }
 }
 
 /// Lets `compute` compute everything below `folder`: one known folder, or a set of them; compares.

@@ -161,7 +161,10 @@ impl Vectors {
         let values = self.tensor(name)?.f32(name)?;
         let full = format!("{} {name}", self.name);
         match expected.tolerance {
-            Some(tolerance) => report.relative(full, &wide(found), &wide(values), tolerance),
+            Some(tolerance) => {
+                let allowed = super::allowed(tolerance);
+                report.relative(full, &wide(found), &wide(values), allowed);
+            }
             None => report.exact(full, found, values),
         }
         Ok(())

@@ -178,9 +178,10 @@ fn one(mut file: Vectors, report: &mut Report) -> Outcome {
 
     model.start_training();
     let trained = model.forward_training(&batch, &mut Cuts::none());
+    let numbers = trained.numbers.read();
     for (name, value) in [
-        ("train_recon_loss", trained.reconstruction),
-        ("train_commit_loss", trained.commitment),
+        ("train_recon_loss", numbers[1]),
+        ("train_commit_loss", numbers[2]),
         (
             "train_total_loss",
             f64::from(to_host(trained.loss.clone())[0]),
@@ -201,7 +202,12 @@ fn one(mut file: Vectors, report: &mut Report) -> Outcome {
             file.compare(report, &output, &shape, &to_host(gradient.clone()))?;
         }
     }
-    let moved = update(model.quantizer_mut(), &trained.assignment, &file, "")?;
+    let moved = update(
+        model.quantizer_mut(),
+        &trained.assigned.to_host(),
+        &file,
+        "",
+    )?;
     file.compare_flags(report, "dead_after_ema", &[codes], &flags(&moved, codes))?;
     file.compare(
         report,

@@ -3,7 +3,7 @@
 //! `backward_in_parts`.
 
 use super::batch::{Batch, EncoderInput};
-use super::loss::{Loss, LossValues};
+use super::loss::{Loss, Losses};
 use super::model::{Mget, decoder_segments};
 use crate::engine::gradients::Complete;
 use crate::engine::{Gradients, Parameters, Segments, Tensor};
@@ -19,7 +19,7 @@ impl Mget {
         kind: Loss,
         share: f64,
         complete: &mut Complete<'_>,
-    ) -> (LossValues, Option<Gradients>) {
+    ) -> (Losses, Option<Gradients>) {
         let frozen = self.frozen();
         let encoder = frozen.encoder_inputs(&batch.visible);
         let context_ND = encoder.last().map(|h_ND| {
@@ -40,12 +40,12 @@ impl Mget {
             batch,
             kind,
         );
-        let values = losses.values();
+        let found = losses.untracked();
         let (Some(y_MD), Some(total)) = (y_MD, losses.total) else {
-            return (values, None);
+            return (found, None);
         };
-        if !values.total.is_finite() {
-            return (values, None);
+        if found.is_known_bad() {
+            return (found, None);
         }
         let [mut dy_MD] = gradients.add(&(total * share), self, [&y_MD]);
         drop(y_MD);
@@ -97,7 +97,7 @@ impl Mget {
             let [] = gradients.add(&(input_ND * dh_ND).sum(), self, []);
         }
         gradients.close("", self, complete);
-        (values, Some(gradients))
+        (found, Some(gradients))
     }
 
     /// The input of every block of the encoder, and the output of the last; nothing when nothing is visible.
@@ -208,9 +208,9 @@ mod tests {
         for batch in cases {
             let whole = model.losses(&batch, Loss::Mod);
             let expected = Gradients::of(&(whole.total.clone().unwrap() * 0.5), &model);
-            let (values, found) = model.recomputed(&batch, Loss::Mod, 0.5, &mut |_, _| ());
+            let (losses, found) = model.recomputed(&batch, Loss::Mod, 0.5, &mut |_, _| ());
             let found = found.unwrap();
-            assert_eq!(values, whole.values());
+            assert_eq!(losses.values(), whole.values());
             assert_eq!(found.iter().count(), expected.iter().count());
             for (name, gradient) in expected.iter() {
                 let other = to_host(found.get(name).unwrap().clone());
@@ -248,9 +248,9 @@ mod tests {
                         told.push((name.to_owned(), bits(gradient)));
                     }
                 };
-                let (values, found) = model.gradients_in_parts(batch, Loss::Mod, 0.5, &mut hear);
+                let (losses, found) = model.gradients_in_parts(batch, Loss::Mod, 0.5, &mut hear);
                 let found = found.unwrap();
-                assert_eq!(values, whole.values());
+                assert_eq!(losses.values(), whole.values());
                 assert_eq!(found.iter().count(), expected.iter().count());
                 assert_eq!(told.len(), expected.iter().count());
                 for (name, early) in &told {
@@ -322,8 +322,8 @@ mod tests {
     fn a_batch_that_asks_for_nothing_has_no_gradient() {
         let nothing: [&[u32]; 3] = [&[], &[], &[]];
         let batch = batch([[&[0], &[], &[]], nothing], [nothing, nothing]);
-        let (values, gradients) = model().recomputed(&batch, Loss::Mod, 1.0, &mut |_, _| ());
-        assert_eq!(values.total, 0.0);
+        let (losses, gradients) = model().recomputed(&batch, Loss::Mod, 1.0, &mut |_, _| ());
+        assert_eq!(losses.values().total, 0.0);
         assert!(gradients.is_none());
     }
 }

@@ -4,7 +4,7 @@
 //! Nothing is computed twice, and nothing is added in another order: the bits are those of [`Mget::losses`] and [`Gradients::of`].
 
 use super::batch::Batch;
-use super::loss::{Loss, LossValues};
+use super::loss::{Loss, Losses};
 use super::model::{Mget, decoder_segments};
 use crate::engine::gradients::Complete;
 use crate::engine::{Gradients, Parameters, Segments, Tensor};
@@ -44,7 +44,7 @@ impl Mget {
         kind: Loss,
         share: f64,
         complete: &mut Complete<'_>,
-    ) -> (LossValues, Option<Gradients>) {
+    ) -> (Losses, Option<Gradients>) {
         let encoder = self.encoder_graph(batch);
         let context_ND = encoder.as_ref().map(|graph| leaf(&graph.context.output));
         let targets = &batch.targets.sequence;
@@ -65,12 +65,12 @@ impl Mget {
         let y_MD = y_MD.as_ref().map(leaf);
         let normed_MD = y_MD.clone().map(|y_MD| self.decoder_norm.forward(y_MD));
         let losses = self.losses_of(normed_MD, batch, kind);
-        let values = losses.values();
+        let found = losses.untracked();
         let (Some(y_MD), Some(queries_MD), Some(total)) = (y_MD, queries_MD, losses.total) else {
-            return (values, None);
+            return (found, None);
         };
-        if !values.total.is_finite() {
-            return (values, None);
+        if found.is_known_bad() {
+            return (found, None);
         }
 
         let mut gradients = Gradients::default();
@@ -97,7 +97,7 @@ impl Mget {
             self.encoder_gradients(graph, dcontext_ND, &mut gradients, complete);
         }
         gradients.close("", self, complete);
-        (values, Some(gradients))
+        (found, Some(gradients))
     }
 
     /// The names of all trainable parameters, in the order in which [`Mget::gradients_in_parts`] completes their gradients.

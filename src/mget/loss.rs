@@ -3,9 +3,8 @@
 use super::batch::Targets;
 use super::embedding::Heads;
 use super::spec::MgetSpec;
-use crate::engine::Tensor;
 use crate::engine::ops::tied_cross_entropy;
-use crate::engine::parameters::to_host;
+use crate::engine::{Reading, Tensor};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
@@ -53,17 +52,42 @@ pub struct LossValues {
 }
 
 impl Losses {
+    /// The total, where there is one, and the means of the modalities that have one, where they are.
+    #[must_use]
+    pub fn reading(&self) -> Reading {
+        let means = self.modalities.iter().flatten().map(|loss| &loss.mean);
+        Reading::of(self.total.iter().chain(means).cloned())
+    }
+
+    /// The same losses, without the graph that they came from.
+    #[must_use]
+    pub(super) fn untracked(&self) -> Self {
+        let of = |loss: &ModalityLoss| ModalityLoss {
+            mean: loss.mean.clone().without_autodiff(),
+            tokens: loss.tokens,
+        };
+        Self {
+            total: self.total.clone().map(Tensor::without_autodiff),
+            modalities: (self.modalities.iter())
+                .map(|loss| loss.as_ref().map(of))
+                .collect(),
+        }
+    }
+
+    /// Whether there is a total that is known, and is no number to step by.
+    #[must_use]
+    pub(crate) fn is_known_bad(&self) -> bool {
+        let total = Reading::of(self.total.clone());
+        total
+            .known()
+            .is_some_and(|known| known.iter().any(|total| !total.is_finite()))
+    }
+
     /// Reads the numbers back, at once.
     #[must_use]
     pub fn values(&self) -> LossValues {
-        let means = self.modalities.iter().flatten().map(|loss| &loss.mean);
-        let all: Vec<Tensor<1>> = self.total.iter().chain(means).cloned().collect();
-        let mut read = Vec::new().into_iter();
-        if !all.is_empty() {
-            let untracked = all.into_iter().map(Tensor::without_autodiff).collect();
-            read = to_host(Tensor::cat(untracked, 0)).into_iter();
-        }
-        let mut next = || read.next().map_or(f64::NAN, f64::from);
+        let mut read = self.reading().read().into_iter();
+        let mut next = || read.next().unwrap_or(f64::NAN);
         LossValues {
             total: self.total.as_ref().map_or(0.0, |_| next()),
             modalities: self

@@ -21,6 +21,7 @@ use crate::experiment::{
 };
 use crate::modality::Shape;
 use crate::tokenizer::video::padding::Padding;
+use crate::training::settings::{READ_EVERY, is_usual};
 use crate::training::tokenizer::TokenizerTraining;
 use crate::training::{AdamWSettings, Duration, Keep};
 use schemars::JsonSchema;
@@ -71,6 +72,11 @@ pub struct TrainTokenizerSettings {
     pub kmeans: bool,
     /// Where to train.
     pub device: DeviceChoice,
+    /// On a GPU, losses and norms of so many steps are read at once: reading waits for the device. Results do not depend on it. The
+    /// processor has them after every step.
+    #[schemars(range(min = 1))]
+    #[serde(skip_serializing_if = "is_usual")]
+    pub read_every: u64,
 }
 
 impl Default for TrainTokenizerSettings {
@@ -95,6 +101,7 @@ impl Default for TrainTokenizerSettings {
             validation_clips: 1000,
             kmeans: true,
             device: DeviceChoice::CPU,
+            read_every: READ_EVERY,
         }
     }
 }

@@ -1,16 +1,21 @@
 //! The codebook of the VQ-VAE tokenizers (Supp. A): codes near the unit sphere, compared by cosine, moved by running means.
 //!
-//! Always f32 and on the host, whatever the model computes in. One training step is: [`Quantizer::assign`] latents to codes,
-//! sum them per code ([`CodeSums`], which add up over processes), [`Quantizer::update`]. Codes that fall out of use are replaced
+//! Always f32, whatever the model computes in. One training step is: [`Quantizer::assign`] latents to codes, sum them per code
+//! ([`CodeSums`], which add up over processes), [`Quantizer::update`]; on a device the same without the host (`on_device`). Codes that fall out of use are replaced
 //! by latents of the batch; because counts start at 0, that is also how a codebook comes to life.
 
-use rand::seq::index;
+mod on_device;
 
+pub use on_device::DeviceAssignment;
+
+use burn::tensor::{Tensor, TensorData};
 use rand::RngExt;
+use rand::seq::index;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::engine::{Initialise, Parameter, ops, parameters};
+use crate::engine::parameters::to_host;
+use crate::engine::{Initialise, Parameter, Reading, ops, parameters};
 use crate::random::{StreamRng, stream};
 
 /// How a codebook learns.
@@ -71,6 +76,29 @@ pub struct Assignment {
     pub ids: Vec<u32>,
     /// The latents at unit length, `[M, L]`.
     pub unit: Vec<f32>,
+}
+
+/// An assignment, where its latents were computed.
+#[derive(Debug, Clone)]
+pub enum Assigned {
+    /// On the processor.
+    Host(Assignment),
+    /// On a device.
+    Device(DeviceAssignment),
+}
+
+impl Assigned {
+    /// On the host; waits for a device.
+    #[must_use]
+    pub fn to_host(&self) -> Assignment {
+        match self {
+            Self::Host(assignment) => assignment.clone(),
+            Self::Device(batch) => Assignment {
+                ids: batch.ids.to_data().iter::<u32>().collect(),
+                unit: to_host(batch.unit_ML.clone()),
+            },
+        }
+    }
 }
 
 /// Counts and sums of unit latents per code; they add up over processes.
@@ -140,6 +168,45 @@ impl Quantizer {
             ids: ops::nearest(&latents, &codes, width),
             unit: latents,
         }
+    }
+
+    /// The nearest code of each latent `[M, L]`, and its values as stored, `[M, L]`.
+    #[must_use]
+    pub fn quantise(&self, z_ML: &Tensor<2>) -> (Tensor<2>, Assigned) {
+        if !ops::on_processor(z_ML) {
+            let (codes_ML, batch) = self.assign_on_device(z_ML.clone());
+            return (codes_ML, Assigned::Device(batch));
+        }
+        let assignment = self.assign(to_host(z_ML.clone()));
+        let data = TensorData::new(self.look_up(&assignment.ids), z_ML.dims());
+        let device = self.state.embed.untracked().device();
+        (Tensor::from_data(data, &device), Assigned::Host(assignment))
+    }
+
+    /// Moves the codes after a step, whose micro-batches were assigned like this; gives how many were replaced. Where all are on a device
+    /// nobody waits for it.
+    pub fn follow(&mut self, batches: Vec<Assigned>, seed: u64, step: u64) -> Reading {
+        let mut on_device = Vec::new();
+        for batch in &batches {
+            if let Assigned::Device(batch) = batch {
+                on_device.push(batch.clone());
+            }
+        }
+        if !batches.is_empty() && on_device.len() == batches.len() {
+            return self.update_on_device(&DeviceAssignment::joined(on_device), seed, step);
+        }
+        let mut whole = Assignment {
+            ids: Vec::new(),
+            unit: Vec::new(),
+        };
+        for batch in batches {
+            let mut batch = batch.to_host();
+            whole.ids.append(&mut batch.ids);
+            whole.unit.append(&mut batch.unit);
+        }
+        let sums = self.sums(&whole);
+        let update = self.update(&sums, &whole.unit, seed, step);
+        Reading::Host(vec![update.dead.len() as f64])
     }
 
     /// The codes of `ids` as stored, `[M, L]`.

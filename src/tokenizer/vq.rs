@@ -12,11 +12,11 @@ use burn::tensor::{Int, Tensor, TensorData};
 
 use super::TokenizerError;
 use super::patches::Patches;
-use super::quantizer::{Assignment, Quantizer};
+use super::quantizer::{Assigned, Quantizer};
 use super::whitening::{Whitening, scale};
 use crate::engine::cuts::backward_order;
 use crate::engine::parameters::to_host;
-use crate::engine::{Cuts, Initialise, Parameter, Parameters, Segments, ops, parameters};
+use crate::engine::{Cuts, Initialise, Parameter, Parameters, Reading, Segments, ops, parameters};
 use crate::modality::Shape;
 use crate::nn::positions;
 use crate::nn::{Block, LayerNorm, Linear, Mlp};
@@ -167,12 +167,11 @@ pub struct Batch {
 pub struct Trained {
     /// Reconstruction plus weighted commitment, `[1]`: what to minimise.
     pub loss: Tensor<1>,
-    /// The two parts.
-    pub reconstruction: f64,
-    /// How far latents are from their codes: mean squared difference.
-    pub commitment: f64,
+    /// What to minimise, and its two parts: the loss of the reconstruction, and how far latents are from their codes, the mean squared
+    /// difference.
+    pub numbers: Reading,
     /// For the codebook's update.
-    pub assignment: Assignment,
+    pub assigned: Assigned,
 }
 
 impl VqVae {
@@ -443,20 +442,24 @@ impl VqVae {
     pub fn forward_training(&self, batch: &Batch, cuts: &mut Cuts) -> Trained {
         let z_NL = self.latents(self.encode_hidden(batch, cuts));
         let z_NL = cuts.at(z_NL);
-        let assignment = self.quantize.assign(to_host(z_NL.clone()));
-        let q_NL = self.codes(&assignment.ids);
+        let (q_NL, assigned) = self.quantize.quantise(&z_NL);
         let step_NL = q_NL - z_NL.clone();
         let commitment = step_NL.clone().square().mean();
         let passed_NL = z_NL + step_NL.detach();
         let found_NP = self.decode_latents(passed_NL, batch.samples, cuts);
         let reconstruction = self.loss(found_NP, batch);
-        let parts = vec![reconstruction.clone(), commitment.clone()];
-        let parts = to_host(Tensor::cat(parts, 0));
+        let parts = [reconstruction.clone(), commitment.clone()];
+        let weight = self.settings.commitment_weight;
+        let loss = reconstruction + commitment * weight;
+        let numbers = Reading::of([loss.clone()].into_iter().chain(parts));
         Trained {
-            reconstruction: f64::from(parts[0]),
-            commitment: f64::from(parts[1]),
-            loss: reconstruction + commitment * self.settings.commitment_weight,
-            assignment,
+            numbers: match numbers {
+                // In f64, where they are known.
+                Reading::Host(all) => Reading::Host(vec![all[1] + weight * all[2], all[1], all[2]]),
+                there => there,
+            },
+            loss,
+            assigned,
         }
     }
 }

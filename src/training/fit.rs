@@ -14,6 +14,8 @@ pub struct Intervals {
     pub validate_every: u64,
     /// A checkpoint after every so many steps; 0: only when stopped.
     pub checkpoint_every: u64,
+    /// Where numbers are on a device, they are read, and steps are told of, after every so many of them; 0: after each.
+    pub read_every: u64,
 }
 
 /// What a callback sees.
@@ -28,7 +30,7 @@ pub enum Event<'a> {
         /// Steps of the whole run.
         total: u64,
     },
-    /// A step was taken.
+    /// A step was taken; where its numbers are on a device, some steps ago.
     Step {
         /// What it did.
         report: &'a StepReport,
@@ -139,14 +141,20 @@ pub fn fit<O: Objective, E: From<TrainingError> + std::fmt::Display>(
             return Err(TrainingError::Stopped.into());
         }
         let step = trainer.progress().step;
-        let report = trainer.step(|index| batch(step, index))?;
-        let step = report.step;
-        let report = Event::Step {
-            report: &report,
-            total,
-        };
-        stop |= agreed(&ranks, callback(report))?;
+        trainer.advance(|index| batch(step, index))?;
+        let step = trainer.progress().step;
         let due = |every: u64| every > 0 && step.is_multiple_of(every) && step < total;
+        let looked_at = due(intervals.validate_every) || due(intervals.checkpoint_every);
+        let unread = trainer.waits().unwrap_or(u64::MAX);
+        if unread >= intervals.read_every || looked_at || step == total {
+            for report in trainer.read()? {
+                let report = Event::Step {
+                    report: &report,
+                    total,
+                };
+                stop |= agreed(&ranks, callback(report))?;
+            }
+        }
         if due(intervals.validate_every) {
             stop |= validated(trainer, callback)?.1;
         }

@@ -2,10 +2,10 @@
 
 use super::schedule::Schedule;
 use super::settings::TrainingSettings;
-use super::trainer::{MicroStep, Objective, Progress, Trainer, TrainingError};
+use super::trainer::{Found, Objective, Progress, Trainer, TrainingError};
 use crate::engine::Gradients;
 use crate::engine::gradients::Complete;
-use crate::mget::{Batch, Loss, LossValues, Mget};
+use crate::mget::{Batch, Loss, Losses, Mget};
 
 /// MGET, trained to predict target tokens from input tokens and raw video.
 #[derive(Debug, Clone)]
@@ -41,7 +41,7 @@ impl MaskedPrediction {
         batch: &Batch,
         share: f64,
         complete: Option<&mut Complete<'_>>,
-    ) -> (LossValues, Option<Gradients>) {
+    ) -> (Losses, Option<Gradients>) {
         let (model, loss) = (&self.model, self.loss);
         if self.activation_checkpointing {
             return match complete {
@@ -53,12 +53,9 @@ impl MaskedPrediction {
             return model.gradients_in_parts(batch, loss, share, complete);
         }
         let losses = self.model.losses(batch, self.loss);
-        let total = losses.total.clone();
-        // Before the losses are read, so that a GPU has all of its work when somebody waits for it.
+        let total = losses.total.clone().filter(|_| !losses.is_known_bad());
         let gradients = total.map(|total| Gradients::of(&(total * share), &self.model));
-        let values = losses.values();
-        let gradients = gradients.filter(|_| values.total.is_finite());
-        (values, gradients)
+        (losses, gradients)
     }
 }
 
@@ -84,16 +81,17 @@ impl Objective for MaskedPrediction {
         batch: &Batch,
         share: f64,
         complete: Option<&mut Complete<'_>>,
-    ) -> Result<MicroStep<()>, TrainingError> {
-        let (values, gradients) = self.gradients(batch, share, complete);
-        let modalities = self.model.spec().modalities.iter().zip(values.modalities);
-        Ok(MicroStep {
-            loss: values.total,
+    ) -> Result<Found<()>, TrainingError> {
+        let (losses, gradients) = self.gradients(batch, share, complete);
+        let modalities = self.model.spec().modalities.iter();
+        let modalities = modalities.zip(&losses.modalities);
+        Ok(Found {
+            numbers: losses.reading(),
             // Nothing where a modality was not asked for.
             parts: modalities
                 .filter_map(|(modality, loss)| {
-                    let (mean, tokens) = loss?;
-                    Some((format!("loss/{}", modality.name), mean, tokens as f64))
+                    let tokens = loss.as_ref()?.tokens as f64;
+                    Some((format!("loss/{}", modality.name), tokens))
                 })
                 .collect(),
             gradients,

@@ -153,6 +153,7 @@ impl MgetFit<'_> {
             Intervals {
                 validate_every: settings.validate_every,
                 checkpoint_every: settings.checkpoint_every,
+                read_every: settings.read_every,
             },
             |_, _| Ok(loader.borrow_mut().next(clock).map_err(wrap)?),
             |objective| {

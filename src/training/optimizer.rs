@@ -14,7 +14,7 @@ use serde::{Deserialize, Serialize};
 
 use super::muon;
 use crate::engine::communicator::shard::Shard;
-use crate::engine::ops::{self, AdamWStep, MuonParameter};
+use crate::engine::ops::{self, AdamWStep, MuonParameter, Norm};
 use crate::engine::parameters::{Kind, to_host};
 use crate::engine::{
     Communicator, Device, EngineError, Gradients, HostTensor, Parameters, RankError, Values,
@@ -114,7 +114,7 @@ pub struct NotFinite {
     pub norm: f64,
 }
 
-/// Refuses step `step` where the norm of its gradient is known and not finite.
+/// Refuses step `step`, counted from 1, where the norm of its gradient is known and not finite.
 fn refuse(step: u64, norm: Option<f64>) -> Result<(), NotFinite> {
     match norm {
         Some(norm) if !norm.is_finite() => Err(NotFinite { step, norm }),
@@ -183,20 +183,38 @@ impl AdamW {
     /// sharded, nothing has moved before [`AdamW::gather`].
     ///
     /// # Errors
-    /// When the norm is not finite. Nothing has changed then.
+    /// When the norm is not finite. No weight has changed then.
     ///
     /// # Panics
     /// When `gradients` or `model` are not of the model the optimizer was made for.
     pub fn step<M: Parameters + ?Sized>(
         &mut self,
         model: &mut M,
-        mut gradients: Gradients,
+        gradients: Gradients,
         rate: f64,
     ) -> Result<f64, NotFinite> {
+        let norm = self.step_unread(model, gradients, rate)?.read();
+        refuse(self.step, Some(norm))?;
+        Ok(norm)
+    }
+
+    /// As [`AdamW::step`], without waiting for a device: where the norm is there, the step refuses itself, and only who reads the norm
+    /// sees whether it did.
+    ///
+    /// # Errors
+    /// When the norm is known and not finite. Nothing has changed then.
+    ///
+    /// # Panics
+    /// As [`AdamW::step`].
+    pub fn step_unread<M: Parameters + ?Sized>(
+        &mut self,
+        model: &mut M,
+        mut gradients: Gradients,
+        rate: f64,
+    ) -> Result<Norm, NotFinite> {
         let norm = gradients.norm();
-        // On a device a step refuses itself, and nobody waits for the norm. But Muon's does not, and what a share has moved is told to the
-        // other ranks at once.
-        let known = if self.settings.muon || self.shard.is_some() {
+        // What a share has moved is told to the other ranks at once.
+        let known = if self.shard.is_some() {
             Some(norm.read())
         } else {
             norm.known()
@@ -247,7 +265,7 @@ impl AdamW {
                 moments.insert(name.to_owned(), Moments { mean, square });
             });
             self.step = next;
-            return Ok(norm.read());
+            return Ok(norm);
         }
         let (mut with_muon, mut names) = (Vec::new(), Vec::new());
         model.visit_mut("", &mut |name, parameter| {
@@ -282,7 +300,7 @@ impl AdamW {
             });
         });
         // All at once, since a matrix alone is too small for several threads.
-        let moved = names.into_iter().zip(ops::muon(with_muon, rate));
+        let moved = names.into_iter().zip(ops::muon(with_muon, rate, &norm));
         let mut moved: BTreeMap<_, _> = moved
             .map(|((name, tracked), after)| (name, (tracked, after)))
             .collect();
@@ -292,8 +310,6 @@ impl AdamW {
                 moments.insert(name.to_owned(), Moments { mean, square: None });
             }
         });
-        let norm = norm.read();
-        refuse(next, Some(norm))?;
         self.step = next;
         Ok(norm)
     }

@@ -52,6 +52,20 @@ pub struct TrainingSettings {
     /// Threads that prepare batches ahead. Results do not depend on it.
     #[schemars(range(min = 1))]
     pub loader_threads: usize,
+    /// On a GPU, losses and norms of so many steps are read at once: reading waits for the device. Results do not depend on it. The
+    /// processor has them after every step.
+    #[schemars(range(min = 1))]
+    #[serde(skip_serializing_if = "is_usual")]
+    pub read_every: u64,
+}
+
+/// Steps on a GPU whose losses are read at once.
+pub const READ_EVERY: u64 = 10;
+
+/// Whether a setting that decides nothing is what it usually is: then it stands in no record.
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "as serde calls it")]
+pub(crate) fn is_usual(every: &u64) -> bool {
+    *every == READ_EVERY
 }
 
 impl Default for TrainingSettings {
@@ -76,6 +90,7 @@ impl Default for TrainingSettings {
             keep: Keep::Last,
             checkpoint_every: 500,
             loader_threads: 1,
+            read_every: READ_EVERY,
         }
     }
 }

@@ -8,15 +8,16 @@ use std::collections::BTreeMap;
 use super::optimizer::AdamWSettings;
 use super::schedule::{Schedule, Shape};
 use super::settings::{Keep, micro_batches};
-use super::trainer::{MicroStep, Objective, Progress, Trainer, TrainingError};
+use super::trainer::ranks::Told;
+use super::trainer::{Found, Named, Objective, Progress, Trainer, TrainingError};
 use super::validation::Score;
 use crate::clip::Signal;
 use crate::engine::communicator::reduce::Reduction;
 use crate::engine::gradients::Complete;
 use crate::engine::parameters::to_host;
-use crate::engine::{Communicator, Cuts, Gradients, Parameters, Tensor};
+use crate::engine::{Communicator, Cuts, Gradients, Parameters, Reading, Tensor};
 use crate::geometry::skeleton::HAND;
-use crate::tokenizer::quantizer::Assignment;
+use crate::tokenizer::quantizer::{Assigned, Assignment};
 use crate::tokenizer::trained::{Prepared, batch};
 use crate::tokenizer::video::{Network, VideoTokenizer};
 use crate::tokenizer::vq::VqVae;
@@ -145,10 +146,20 @@ impl Trainer<VqReconstruction> {
     }
 }
 
+impl Told for Assigned {
+    fn to_bytes(&self) -> Vec<u8> {
+        self.to_host().to_bytes()
+    }
+
+    fn of_bytes(bytes: &[u8]) -> Option<Self> {
+        Assignment::of_bytes(bytes).map(Self::Host)
+    }
+}
+
 impl Objective for VqReconstruction {
     type Module = VqVae;
     type Batch = Vec<Prepared>;
-    type Trace = Assignment;
+    type Trace = Assigned;
 
     fn module(&self) -> &VqVae {
         &self.model
@@ -167,45 +178,38 @@ impl Objective for VqReconstruction {
         signals: &Vec<Prepared>,
         share: f64,
         complete: Option<&mut Complete<'_>>,
-    ) -> Result<MicroStep<Assignment>, TrainingError> {
+    ) -> Result<Found<Assigned>, TrainingError> {
         let mut cuts = Cuts::wanted(complete.is_some());
         let batch = batch(&self.model, signals);
         let trained = self.model.forward_training(&batch, &mut cuts);
-        let weight = self.model.settings().commitment_weight;
-        let loss = trained.reconstruction + weight * trained.commitment;
         let samples = signals.len() as f64;
-        Ok(MicroStep {
-            loss,
+        let bad = is_known_bad(&trained.numbers);
+        Ok(Found {
+            numbers: trained.numbers,
             parts: vec![
-                (
-                    "loss/reconstruction".into(),
-                    trained.reconstruction,
-                    samples,
-                ),
-                ("loss/commitment".into(), trained.commitment, samples),
+                ("loss/reconstruction".into(), samples),
+                ("loss/commitment".into(), samples),
             ],
-            gradients: loss
-                .is_finite()
+            gradients: (!bad)
                 .then(|| gradients(cuts, &(trained.loss * share), &self.model, complete)),
             used: used(signals.len()),
-            trace: trained.assignment,
+            trace: trained.assigned,
         })
     }
 
-    fn finish_step(&mut self, traces: Vec<Assignment>, step: u64) -> Vec<(String, f64)> {
-        let mut whole = Assignment {
-            ids: Vec::new(),
-            unit: Vec::new(),
-        };
-        for mut assignment in traces {
-            whole.ids.append(&mut assignment.ids);
-            whole.unit.append(&mut assignment.unit);
-        }
+    fn finish_step(&mut self, traces: Vec<Assigned>, step: u64) -> Named {
         let quantizer = self.model.quantizer_mut();
-        let sums = quantizer.sums(&whole);
-        let update = quantizer.update(&sums, &whole.unit, self.seed, step);
-        vec![("codes/replaced".into(), update.dead.len() as f64)]
+        Named {
+            names: vec!["codes/replaced".into()],
+            numbers: quantizer.follow(traces, self.seed, step),
+        }
     }
+}
+
+/// Whether the first number, a loss, is known and not finite.
+fn is_known_bad(numbers: &Reading) -> bool {
+    let loss = numbers.known().and_then(<[f64]>::first);
+    loss.is_some_and(|loss| !loss.is_finite())
 }
 
 /// A video tokenizer, trained on the squared error of pixels and on even use of the codes.
@@ -284,19 +288,19 @@ impl Objective for VideoReconstruction {
         clips: &Vec<Signal>,
         share: f64,
         complete: Option<&mut Complete<'_>>,
-    ) -> Result<MicroStep<()>, TrainingError> {
+    ) -> Result<Found<()>, TrainingError> {
         if clips.is_empty() {
             return Err(TrainingError::NoData);
         }
         let mut cuts = Cuts::wanted(complete.is_some());
         let trained = self.model.train(clips, &mut cuts)?;
-        let loss = f64::from(trained.loss.clone().into_scalar::<f32>());
-        let gradients = loss.is_finite().then(|| {
+        let numbers = Reading::of([trained.loss.clone()]);
+        let gradients = (!is_known_bad(&numbers)).then(|| {
             let total = trained.loss + trained.unevenness * EVENNESS;
             gradients(cuts, &(total * share), self.model.network(), complete)
         });
-        Ok(MicroStep {
-            loss,
+        Ok(Found {
+            numbers,
             parts: Vec::new(),
             gradients,
             used: used(clips.len()),
@@ -592,7 +596,7 @@ mod tests {
                 trainer,
                 Intervals {
                     validate_every: 2,
-                    checkpoint_every: 0,
+                    ..Intervals::default()
                 },
                 |step, micro| -> Result<_, TrainingError> {
                     let chosen = epochs.choose(step, micro, data.len())?;

@@ -4,6 +4,7 @@ use super::epochs::Epochs;
 use super::fit::{Callback, Intervals, fit, progress};
 use super::kmeans::KMeans;
 use super::mixture::Mixture;
+use super::settings::READ_EVERY;
 use super::signals::extract;
 use super::tokenizer::{TokenizerTraining, mirrored};
 use super::tokenizer_scores::{Baselines, Example, Scores, score};
@@ -474,7 +475,10 @@ impl Tokenizers {
                 held_out_clips: 0,
                 tokenizer: settings,
                 training: training.clone(),
-                intervals: Intervals::default(),
+                intervals: Intervals {
+                    read_every: READ_EVERY,
+                    ..Intervals::default()
+                },
                 calibrate: true,
                 mirror: match name.as_str() {
                     "left_hand" => Some("right_hand"),

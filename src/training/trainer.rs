@@ -2,11 +2,18 @@
 //!
 //! What differs is an [`Objective`]: the module, its loss on a micro-batch, and what a step changes that no gradient does
 //! (codebooks). Everything a step does is a function of the seed, the step and the state.
+//!
+//! A device is not waited for inside a step: [`Trainer::advance`] leaves losses and norms where they are, and [`Trainer::read`] reads
+//! those of all steps since at once. On the processor, and where several ranks train, they are known when the step is taken.
 
 pub mod checkpoint;
 pub mod ranks;
+mod unread;
+
+pub use unread::{Found, Named};
 
 use self::ranks::{Ranks, ShareError, Told};
+use self::unread::Unread;
 use super::optimizer::{AdamW, AdamWSettings, NotFinite};
 use super::schedule::{Schedule, ScheduleError};
 use super::settings::{Keep, SettingsError};
@@ -39,7 +46,7 @@ pub trait Objective {
     /// The module, to be changed by the optimizer or a checkpoint.
     fn module_mut(&mut self) -> &mut Self::Module;
 
-    /// The loss of a micro-batch, and the gradients of `share` times it; changes nothing. `complete`, where there is one, may hear of
+    /// The loss of a micro-batch, and the gradients of `share` times it; changes nothing, and waits for no device. `complete`, where there is one, may hear of
     /// gradients as soon as backward is done with them, so that they are sent while it goes on.
     ///
     /// # Errors
@@ -49,7 +56,7 @@ pub trait Objective {
         batch: &Self::Batch,
         share: f64,
         complete: Option<&mut Complete<'_>>,
-    ) -> Result<MicroStep<Self::Trace>, TrainingError>;
+    ) -> Result<Found<Self::Trace>, TrainingError>;
 
     /// The names of the parameters, about in the order in which backward completes their gradients.
     fn backward_order(&self) -> Vec<String> {
@@ -58,13 +65,13 @@ pub trait Objective {
 
     /// What the step changes besides what the gradients did, after the optimizer; `step` is counted from 0. Returns further
     /// numbers for the report.
-    fn finish_step(&mut self, traces: Vec<Self::Trace>, step: u64) -> Vec<(String, f64)> {
+    fn finish_step(&mut self, traces: Vec<Self::Trace>, step: u64) -> Named {
         let _ = (traces, step);
-        Vec::new()
+        Named::none()
     }
 }
 
-/// What a forward and backward pass over one micro-batch gave.
+/// What a forward and backward pass over one micro-batch found, as ranks tell each other.
 #[derive(Debug)]
 pub struct MicroStep<T> {
     /// What is minimised.
@@ -90,6 +97,7 @@ pub struct Trainer<O> {
     keep: Keep,
     best: Option<Best>,
     progress: Progress,
+    unread: Vec<Unread>,
 }
 
 /// What a checkpoint says besides weights and moments.
@@ -122,6 +130,8 @@ pub struct StepReport {
     pub progress: Progress,
     /// Seconds that steps have waited for data so far.
     pub waited: f64,
+    /// How many later steps were taken before this one was read; 0 on the processor.
+    pub behind: u64,
 }
 
 impl StepReport {
@@ -277,6 +287,7 @@ impl<O: Objective> Trainer<O> {
             keep,
             best: None,
             progress: Progress::default(),
+            unread: Vec::new(),
         }
     }
 
@@ -294,20 +305,31 @@ impl<O: Objective> Trainer<O> {
         Ok(self)
     }
 
-    /// Takes one step; `next(i)` gives its micro-batch `i`, of those that are this rank's ([`Ranks::own`]).
+    /// Takes one step, and reads what it did; `next(i)` gives its micro-batch `i`, of those that are this rank's ([`Ranks::own`]).
     ///
     /// # Errors
-    /// When a batch cannot be had, or loss or gradient are not finite, here or on another rank. Model and optimizer are as before
-    /// then.
+    /// When a batch cannot be had, or loss or gradient are not finite, here or on another rank. Model and optimizer are as before then,
+    /// but on a device: there no weight has changed, and the optimizer has counted the step.
     pub fn step<E: From<TrainingError> + std::fmt::Display>(
         &mut self,
-        mut next: impl FnMut(usize) -> Result<O::Batch, E>,
+        next: impl FnMut(usize) -> Result<O::Batch, E>,
     ) -> Result<StepReport, E> {
+        self.advance(next)?;
+        let mut reports = self.read()?;
+        Ok(reports.pop().expect("the step that was just taken"))
+    }
+
+    /// As [`Trainer::step`], but waits for no device: the report comes with the next [`Trainer::read`], and so does an error that only
+    /// the device knows of. Steps behind a refused one are taken before that.
+    ///
+    /// # Errors
+    /// As [`Trainer::step`], of what is known.
+    pub fn advance<E: From<TrainingError> + std::fmt::Display>(
+        &mut self,
+        mut next: impl FnMut(usize) -> Result<O::Batch, E>,
+    ) -> Result<(), E> {
         let mut progress = self.progress;
         progress.step += 1;
-        let mut loss = 0.0;
-        let mut parts: Vec<(String, f64, f64)> = Vec::new();
-        let mut traces = Vec::new();
         let samples: usize = self.micro_batches.iter().sum();
         let shares: Vec<f64> = self
             .micro_batches
@@ -318,46 +340,89 @@ impl<O: Objective> Trainer<O> {
         let micro_step = |index: usize, complete: Option<&mut Complete<'_>>| -> Result<_, E> {
             let batch = next(index)?;
             // The loss of a step is the mean over its micro-batches, as in the reference.
-            let micro = objective.micro_step(&batch, shares[index], complete)?;
-            Ok(micro)
+            let found = objective.micro_step(&batch, shares[index], complete)?;
+            Ok(found)
         };
-        let (step, model) = (self.progress.step, objective.module());
-        let (micros, sum) = self.ranks.sum(step, shares.len(), model, micro_step)?;
-        for (micro, share) in micros.into_iter().zip(&shares) {
-            progress.samples += micro.used.samples;
-            progress.input_tokens += micro.used.input_tokens;
-            progress.target_tokens += micro.used.target_tokens;
-            if !micro.loss.is_finite() {
-                let (step, loss) = (progress.step, micro.loss);
+        let (found, sum) = self.computed(shares.len(), micro_step)?;
+        let (mut micros, mut traces) = (Vec::new(), Vec::new());
+        for (found, share) in found.into_iter().zip(&shares) {
+            progress.samples += found.used.samples;
+            progress.input_tokens += found.used.input_tokens;
+            progress.target_tokens += found.used.target_tokens;
+            if let Some(loss) = found.bad_loss() {
+                let step = progress.step;
                 return Err(TrainingError::Loss { step, loss }.into());
             }
-            loss += micro.loss * share;
-            add(&mut parts, micro.parts);
-            traces.push(micro.trace);
+            micros.push((found.numbers, found.parts, *share));
+            traces.push(found.trace);
         }
         let learning_rate = self.schedule.rate(self.progress.step);
         let mut gradients = sum.unwrap_or_default();
         gradients.complete(self.objective.module());
-        let gradient_norm = self
+        let norm = self
             .optimizer
-            .step(self.objective.module_mut(), gradients, learning_rate)
+            .step_unread(self.objective.module_mut(), gradients, learning_rate)
             .map_err(TrainingError::from)?;
         self.optimizer
             .gather(self.objective.module_mut())
             .map_err(TrainingError::from)?;
-        self.ranks.note(gradient_norm);
+        if self.ranks.communicator().size() > 1 {
+            self.ranks.note(norm.read());
+        }
         let further = self.objective.finish_step(traces, self.progress.step);
         self.progress = progress;
-        let parts = parts.into_iter().map(|(name, mean, _)| (name, mean));
-        Ok(StepReport {
-            step: progress.step,
-            loss,
-            parts: parts.chain(further).collect(),
+        self.unread.push(Unread {
+            micros,
+            norm: norm.into(),
+            further,
             learning_rate,
-            gradient_norm,
             progress,
-            waited: 0.0,
-        })
+        });
+        Ok(())
+    }
+
+    /// What all ranks found in the micro-batches of a step, and the sum of their gradients.
+    fn computed<E: From<TrainingError> + std::fmt::Display>(
+        &self,
+        count: usize,
+        mut micro_step: impl FnMut(usize, Option<&mut Complete<'_>>) -> Result<Found<O::Trace>, E>,
+    ) -> Result<(Vec<Found<O::Trace>>, Option<Gradients>), E> {
+        if self.ranks.communicator().size() == 1 {
+            let (mut all, mut sum): (Vec<_>, Option<Gradients>) = (Vec::new(), None);
+            for index in 0..count {
+                let mut found = micro_step(index, None)?;
+                if let Some(gradients) = found.gradients.take() {
+                    sum = Some(match sum {
+                        Some(sum) => sum.plus(gradients),
+                        None => gradients,
+                    });
+                }
+                all.push(found);
+            }
+            return Ok((all, sum));
+        }
+        let told = |index: usize, complete: Option<&mut Complete<'_>>| {
+            micro_step(index, complete).map(Found::told)
+        };
+        let (step, model) = (self.progress.step, self.objective.module());
+        let (micros, sum) = self.ranks.sum(step, count, model, told)?;
+        Ok((micros.into_iter().map(Found::heard).collect(), sum))
+    }
+
+    /// How many steps were taken that nobody has read, where reading them waits for a device; all are known elsewhere.
+    #[must_use]
+    pub fn waits(&self) -> Option<u64> {
+        let known = self.unread.iter().all(Unread::is_known);
+        (!known).then_some(self.unread.len() as u64)
+    }
+
+    /// The reports of the steps since the last reading, in order.
+    ///
+    /// # Errors
+    /// When the loss or the gradient of one of them was not finite. It has changed no weight; what was computed behind it is not to be
+    /// kept.
+    pub fn read(&mut self) -> Result<Vec<StepReport>, TrainingError> {
+        Unread::read(std::mem::take(&mut self.unread))
     }
 
     /// Takes note of held-out losses; where the best weights are to be kept, these are if they are better.
@@ -420,18 +485,5 @@ impl<O: Objective> Trainer<O> {
     #[must_use]
     pub fn micro_batches(&self) -> &[usize] {
         &self.micro_batches
-    }
-}
-
-/// Adds weighted means of another micro-batch.
-fn add(sums: &mut Vec<(String, f64, f64)>, parts: Vec<(String, f64, f64)>) {
-    for (name, mean, weight) in parts {
-        match sums.iter_mut().find(|sum| sum.0 == name) {
-            Some((_, a, wa)) => {
-                *a = (*a * *wa + mean * weight) / (*wa + weight);
-                *wa += weight;
-            }
-            None => sums.push((name, mean, weight)),
-        }
     }
 }

@@ -43,6 +43,7 @@ mod shipped;
 mod skipped;
 #[cfg(unix)]
 mod slurm;
+mod software_device;
 mod statistics;
 mod sweep_compare;
 mod sweeps;

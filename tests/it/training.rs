@@ -3,7 +3,7 @@
 
 use reviv::engine::{Communicator, Compute, Initialise, Parameters, Weights};
 use reviv::masking::{Masking, MaskingSettings, TokenBudget};
-use reviv::mget::{Mget, MgetSpec, ModalitySpec, Positions, Size};
+use reviv::mget::{Batch, Mget, MgetSpec, ModalitySpec, Positions, Size};
 use reviv::random::stream;
 use reviv::tokenizer::TokenGrid;
 use reviv::training::{
@@ -67,7 +67,7 @@ pub struct Setup {
 }
 
 impl Setup {
-    fn new(steps: u64, micro_batch: usize, threads: usize) -> Self {
+    pub fn new(steps: u64, micro_batch: usize, threads: usize) -> Self {
         Self {
             settings: TrainingSettings {
                 steps: Some(steps),
@@ -92,8 +92,11 @@ impl Setup {
     }
 
     fn trainer(&self) -> Trainer<MaskedPrediction> {
-        let compute = Compute::cpu();
-        let model = Mget::new(&spec(), &Initialise::new(&compute, 7)).unwrap();
+        self.trainer_on(&Compute::cpu())
+    }
+
+    pub fn trainer_on(&self, compute: &Compute) -> Trainer<MaskedPrediction> {
+        let model = Mget::new(&spec(), &Initialise::new(compute, 7)).unwrap();
         let measure = DatasetSize {
             clips: self.source.len() as u64,
             tokens_per_sample: 16,
@@ -115,6 +118,12 @@ impl Setup {
             micro_batches: self.settings.micro_batches(),
             repeat: 1,
         })
+    }
+
+    /// The first micro-batches.
+    pub fn batches(&self, count: usize) -> Vec<Batch> {
+        let mut loader = Loader::start(&self.feed(), 0..self.steps, &[0], 1);
+        (0..count).map(|_| loader.next(&|| 0.0).unwrap()).collect()
     }
 
     fn run(

@@ -157,9 +157,11 @@ def masks(count):
     return given, asked
 
 
-def run(size, repeats):
+def run(size, repeats, compiled=False):
     samples, count = BATCHES[size]
     model = Mget(size)
+    if compiled:
+        model.compile()
     ids = tokens(samples)
     given, asked = masks(count)
 

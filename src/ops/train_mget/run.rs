@@ -214,6 +214,10 @@ impl Record<'_> {
         let mut scalars = report.scalars();
         scalars.push(("tokens/nominal", nominal));
         scalars.push(("tokens/real", real as f64));
+        // Of steps that were read at once, all have ended now.
+        if report.behind > 0 {
+            return context.record(report.step, &scalars);
+        }
         if let Some((before, then)) = self.last.replace((real, now)) {
             let rate = (real - before) as f64 / (now - then).max(1e-9);
             scalars.push(("tokens/per_second", rate));

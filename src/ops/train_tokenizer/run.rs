@@ -71,6 +71,7 @@ pub(super) fn run(
         intervals: Intervals {
             validate_every: settings.validate_every,
             checkpoint_every: settings.checkpoint_every,
+            read_every: settings.read_every,
         },
         calibrate: settings.calibrate,
         mirror: settings.other_hand(),

@@ -10,8 +10,8 @@ use super::padding::Padding;
 use super::settings::COLOURS;
 use super::{Fsq, Network, VideoSettings, haar};
 use crate::clip::Signal;
-use crate::engine::Cuts;
 use crate::engine::parameters::to_host;
+use crate::engine::{Cuts, ops};
 use crate::tokenizer::normaliser::Normaliser;
 use crate::tokenizer::trained::FILE;
 use crate::tokenizer::{TokenGrid, Tokenizer, TokenizerError, check_tokens};
@@ -36,8 +36,6 @@ pub struct Trained {
     pub loss: Tensor<1>,
     /// How far the latents are from those that use all codes evenly, `[1]`.
     pub unevenness: Tensor<1>,
-    /// The tokens the batch went through.
-    pub tokens: Vec<u32>,
 }
 
 impl VideoTokenizer {
@@ -193,35 +191,30 @@ impl VideoTokenizer {
         let latents = cuts.at(latents);
         let unevenness = unevenness(latents.clone());
         let bounded = self.bound(latents);
-        let host = to_host(bounded.clone());
-        let tokens = self.fsq.index(&host);
-        let width = self.fsq.width();
-        let device = self.device();
-        let codes = Tensor::from_data(
-            TensorData::new(self.fsq.decode(&tokens), [tokens.len(), width]),
-            &device,
-        );
-        let soft = bounded / self.row(|levels| (levels / 2) as f64);
+        let codes = self.rounded(bounded.clone().without_autodiff());
+        let soft = bounded / self.half_levels();
         let offset: Tensor<2> = codes - soft.clone().without_autodiff();
         let found = self.pixels(soft + offset, samples, cuts);
-        let kept = self.kept(samples);
-        let count = kept.clone().sum().into_scalar::<f32>() as f64;
+        let (kept, count) = self.kept(samples);
         let loss = ((found - blocks).square() * kept).sum() / count;
-        Ok(Trained {
-            loss,
-            unevenness,
-            tokens,
-        })
+        Ok(Trained { loss, unevenness })
     }
 
-    /// `[1, width]` of a function of each dimension's levels.
-    fn row(&self, value: impl Fn(usize) -> f64) -> Tensor<2> {
-        let values: Vec<f32> = self
-            .settings()
-            .levels
-            .iter()
-            .map(|l| value(*l) as f32)
-            .collect();
+    /// The codes of squashed latents; on a device nobody waits for them.
+    fn rounded(&self, bounded: Tensor<2>) -> Tensor<2> {
+        if !ops::on_processor(&bounded) {
+            return bounded.round() / self.half_levels();
+        }
+        let shape = bounded.dims();
+        let tokens = self.fsq.index(&to_host(bounded));
+        let codes = TensorData::new(self.fsq.decode(&tokens), shape);
+        Tensor::from_data(codes, &self.device())
+    }
+
+    /// Half of each dimension's levels, rounded down, `[1, width]`: what makes a code of a level.
+    fn half_levels(&self) -> Tensor<2> {
+        let levels = self.settings().levels.iter();
+        let values: Vec<f32> = levels.map(|levels| (levels / 2) as f32).collect();
         let width = values.len();
         Tensor::from_data(TensorData::new(values, [1, width]), &self.device())
     }
@@ -237,8 +230,8 @@ impl VideoTokenizer {
     }
 
     /// 1 where a value of a block stands for a pixel of the padded clip, 0 where it repeats the padded clip's first frame.
-    /// Padding counts: edge frames in front and at the end, zeros at the sides.
-    fn kept(&self, samples: usize) -> Tensor<2> {
+    /// Padding counts: edge frames in front and at the end, zeros at the sides. And how many there are, as f32 has it.
+    fn kept(&self, samples: usize) -> (Tensor<2>, f64) {
         let extent = self.extent(samples);
         let (patch, side) = (self.settings().patch, self.settings().coefficients());
         let repeated = (patch - 1) * side / patch;
@@ -247,10 +240,9 @@ impl VideoTokenizer {
             let first = (row / extent.pixels()).is_multiple_of(extent.frames);
             values.extend((0..side).map(|i| f32::from(u8::from(!first || i >= repeated))));
         }
-        Tensor::from_data(
-            TensorData::new(values, [extent.rows(), side]),
-            &self.device(),
-        )
+        let count = values.iter().filter(|value| **value != 0.0).count() as f32;
+        let values = TensorData::new(values, [extent.rows(), side]);
+        (Tensor::from_data(values, &self.device()), f64::from(count))
     }
 
     /// The values of signals, row-major, checked for shape and finiteness.

@@ -8,10 +8,11 @@
 //! * [`weights`]: named arrays on the host and the safetensors files they live in;
 //! * [`initialise`]: where the numbers of a new model come from;
 //! * [`ops`]: linear, layer norm, attention over packed segments, GELU, SwiGLU, cross-entropy, convolution and frame norm of
-//!   video. On the CPU each is one fused operation with a hand-written backward; on other back ends it is unfused of the
-//!   library's own operations. Nearest code is a search on the host; embedding is the library's select everywhere;
+//!   video. On the CPU each is one fused operation with a hand-written backward; on GPUs it is a kernel, or made of the library's own
+//!   operations where those have a good form;
 //! * [`gradients`]: gradients by parameter name, their global norm, and who hears of them while backward goes on;
 //! * [`cuts`]: a graph that is cut, so that backward goes part by part;
+//! * [`mod@reading`]: losses and norms that a device may not have computed yet;
 //! * [`communicator`]: processes that train one model together;
 //! * [`memory`]: an allocator that uses the memory of one step again in the next.
 
@@ -23,6 +24,7 @@ pub mod initialise;
 pub mod memory;
 pub mod ops;
 pub mod parameters;
+pub mod reading;
 pub mod segments;
 pub mod weights;
 
@@ -33,6 +35,7 @@ pub use cuts::Cuts;
 pub use gradients::{Complete, Gradients};
 pub use initialise::Initialise;
 pub use parameters::{Parameter, Parameters, parameters};
+pub use reading::Reading;
 pub use segments::{Segment, Segments};
 pub use weights::{HostTensor, Values, Weights};
 

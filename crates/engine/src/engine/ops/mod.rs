@@ -31,6 +31,12 @@ const FRAME_NORM_EPSILON: f32 = 1e-6;
 /// An input that an operation does not have.
 const NONE: Option<Tensor<1>> = None;
 
+/// Whether `x` is on the processor, where its values are known at once.
+#[must_use]
+pub fn on_processor<const D: usize>(x: &Tensor<D>) -> bool {
+    fused::takes(x)
+}
+
 fn check_segments(segments: &Segments, queries: &Tensor<2>, keys: &Tensor<2>) {
     assert_eq!(
         segments.queries(),

@@ -3,7 +3,7 @@
 
 use burn::tensor::Tensor;
 
-use super::{fused, linear};
+use super::{Norm, fused, linear};
 
 /// How much of the momentum is kept from step to step.
 pub(super) const MOMENTUM: f64 = 0.95;
@@ -43,12 +43,13 @@ impl MuonParameter {
     }
 }
 
-/// One step of each parameter, at learning rate `rate`: its new values and momentum, in place where nobody else holds them.
+/// One step of each parameter, at learning rate `rate`: its new values and momentum, in place where nobody else holds them. `norm` is
+/// that of all gradients together; where a device has it and it is not finite, nothing changes.
 ///
 /// # Panics
 /// When a parameter is no stack of matrices, or its gradient or momentum has another length.
 #[must_use]
-pub fn muon(parameters: Vec<MuonParameter>, rate: f64) -> Vec<(Tensor<1>, Tensor<1>)> {
+pub fn muon(parameters: Vec<MuonParameter>, rate: f64, norm: &Norm) -> Vec<(Tensor<1>, Tensor<1>)> {
     for parameter in &parameters {
         let [rows, columns] = parameter.shape;
         let whole = parameter.matrices > 0 && rows.is_multiple_of(parameter.matrices);
@@ -60,10 +61,24 @@ pub fn muon(parameters: Vec<MuonParameter>, rate: f64) -> Vec<(Tensor<1>, Tensor
     if parameters.iter().all(|one| fused::takes(&one.values)) {
         return fused::muon(parameters, rate);
     }
-    parameters
-        .into_iter()
-        .map(|parameter| unfused(parameter, rate))
-        .collect()
+    let refused = match norm {
+        Norm::Host(_) => None,
+        Norm::Device(norm) => Some(norm.clone().is_finite().bool_not()),
+    };
+    let each = parameters.into_iter().map(|parameter| {
+        let before = [parameter.values.clone(), parameter.momentum.clone()];
+        let (values, momentum) = unfused(parameter, rate);
+        let Some(refused) = &refused else {
+            return (values, momentum);
+        };
+        let [old_values, old_momentum] = before;
+        let refused = refused.clone().expand(old_values.dims());
+        (
+            values.mask_where(refused.clone(), old_values),
+            momentum.mask_where(refused, old_momentum),
+        )
+    });
+    each.collect()
 }
 
 /// What an orthogonal matrix of this shape is multiplied by, at learning rate 1.
@@ -159,7 +174,7 @@ mod tests {
             parameter([48, 20], 1),
             parameter([16, 16], 2),
         ];
-        let fused = muon(parameters.clone(), 0.02);
+        let fused = muon(parameters.clone(), 0.02, &Norm::Host(1.0));
         for (parameter, fused) in parameters.into_iter().zip(fused) {
             let shape = parameter.shape;
             let composed = unfused(parameter, 0.02);
@@ -175,7 +190,10 @@ mod tests {
     fn a_step_has_the_same_bytes_on_any_number_of_threads() {
         let run = |threads: usize| {
             let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build();
-            let step = || muon(vec![parameter([96, 32], 3), parameter([32, 64], 1)], 0.02);
+            let step = || {
+                let parameters = vec![parameter([96, 32], 3), parameter([32, 64], 1)];
+                muon(parameters, 0.02, &Norm::Host(1.0))
+            };
             let moved = pool.unwrap().install(step).into_iter();
             moved
                 .flat_map(|(values, _)| to_host(values))

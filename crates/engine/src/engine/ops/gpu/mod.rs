@@ -236,7 +236,7 @@ mod tests {
 
     use burn::tensor::{Tensor, TensorData};
 
-    use super::super::{self as ops, AdamWStep, Norm};
+    use super::super::{self as ops, AdamWStep, MuonParameter, Norm};
     use super::*;
     use crate::engine::parameters::to_host;
     use crate::engine::{Compute, DeviceChoice, DeviceKind, Precision, Segment};
@@ -443,6 +443,44 @@ mod tests {
             let found = stepped(&gradient, Some(1.0), &gpu);
             assert_eq!(found[0], values, "{bad}");
             assert_ne!(still[0], values);
+        }
+    }
+
+    /// Values and momentum of a matrix after a step of Muon.
+    fn muon_stepped(gradient: &[f32; 96], device: &Device) -> [Vec<f32>; 2] {
+        let gradient = flat(gradient, device);
+        let norm = Norm::of(std::iter::once(&gradient));
+        let parameter = MuonParameter {
+            values: wave([1, 96], 0.2, device).reshape([-1]),
+            gradient,
+            momentum: wave([1, 96], 0.9, device).reshape([-1]),
+            shape: [12, 8],
+            matrices: 2,
+            decay: 0.01,
+        };
+        let (values, momentum) = ops::muon(vec![parameter], 0.02, &norm).remove(0);
+        [values, momentum].map(to_host)
+    }
+
+    #[test]
+    fn a_step_of_muon_agrees_with_the_processor_and_one_that_is_not_finite_changes_nothing() {
+        let Some(gpu) = gpu() else { return };
+        let mut gradient = [0.0; 96];
+        for (at, value) in gradient.iter_mut().enumerate() {
+            *value = (at as f32 * 0.7).sin();
+        }
+        let (here, there) = (
+            muon_stepped(&gradient, &Device::flex()),
+            muon_stepped(&gradient, &gpu),
+        );
+        for (found, expected) in there.iter().zip(&here) {
+            let worst = found.iter().zip(expected).map(|(a, b)| (a - b).abs());
+            assert!(worst.fold(0.0, f32::max) < 1e-5);
+        }
+        for bad in [f32::NAN, f32::INFINITY] {
+            gradient[17] = bad;
+            let before = [0.2, 0.9].map(|phase| to_host(wave([1, 96], phase, &gpu)));
+            assert_eq!(muon_stepped(&gradient, &gpu), before, "{bad}");
         }
     }
 
