@@ -44,8 +44,8 @@ cases=(product mget-tiny mget-base tokenizer video depth-short decoding-fast)
 rounded=(product mget-tiny mget-base decoding-fast)
 compiled=(mget-tiny mget-base)
 if [ -n "$short" ]; then
-    cases=(decoding-fast)
-    rounded=(decoding-fast)
+    cases=(mget-short)
+    rounded=(mget-short)
     compiled=()
     rounds=1
 fi
