@@ -127,7 +127,7 @@ speed() {
     echo "## $heading"
     echo
     if [ ! -f "$work/speed.md" ]; then
-        echo "Not measured: $(tail -n 1 "$work/speed.err")"
+        echo "Not measured: $(grep -m 1 '^error' "$work/speed.err" || tail -n 1 "$work/speed.err")"
         return
     fi
     sed '1,2d' "$work/speed.md"
