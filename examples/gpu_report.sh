@@ -44,8 +44,8 @@ cases=(product mget-tiny mget-base tokenizer video depth-short decoding-fast)
 rounded=(product mget-tiny mget-base decoding-fast)
 compiled=(mget-tiny mget-base)
 if [ -n "$short" ]; then
-    cases=(decoding-fast)
-    rounded=(decoding-fast)
+    cases=(mget-short)
+    rounded=(mget-short)
     compiled=()
     rounds=1
 fi
@@ -127,7 +127,7 @@ speed() {
     echo "## $heading"
     echo
     if [ ! -f "$work/speed.md" ]; then
-        echo "Not measured: $(tail -n 1 "$work/speed.err")"
+        echo "Not measured: $(grep -m 1 '^error' "$work/speed.err" || tail -n 1 "$work/speed.err")"
         return
     fi
     sed '1,2d' "$work/speed.md"

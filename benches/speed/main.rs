@@ -22,6 +22,7 @@ use clap::{Parser, ValueEnum};
 use measure::Meter;
 use peer::{Answers, Question, Side};
 use reviv::engine::{Compute, DeviceChoice, Precision};
+use reviv::mget::Size;
 use std::num::NonZeroUsize;
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -86,6 +87,8 @@ enum Case {
     Depth,
     /// The same with a window of 8 frames.
     DepthShort,
+    /// MGET `laptop_small`: forward, train step; for a look at whether everything runs.
+    MgetShort,
     /// MGET `tiny`: forward, train step.
     MgetTiny,
     /// MGET `base`: forward, train step.
@@ -116,6 +119,7 @@ impl Case {
             Self::Video => "video tokenizer (Cosmos DV4x8x8, 17 x 256 x 256)",
             Self::Depth => "depth network (Video Depth Anything Small, 32 x 518 x 518)",
             Self::DepthShort => "depth network (Video Depth Anything Small, 8 x 518 x 518)",
+            Self::MgetShort => "MGET `laptop_small` (2 samples, 128 + 128 tokens)",
             Self::MgetTiny => "MGET `tiny` (8 samples, 256 + 256 tokens)",
             Self::MgetBase => "MGET `base` (1 sample, 1024 + 1024 tokens)",
             Self::Packing => "MGET `tiny` (8 samples, at most 512 + 512 tokens)",
@@ -131,7 +135,7 @@ impl Case {
     /// Measurements per round: more of what is quick.
     fn repeats(self) -> usize {
         match self {
-            Self::MgetTiny => 5,
+            Self::MgetShort | Self::MgetTiny => 5,
             Self::Tokenizer | Self::Packing | Self::DecodingFast | Self::Product => 3,
             Self::Video | Self::MgetBase | Self::ActivationCheckpointing => 2,
             Self::DepthShort | Self::Depth | Self::DecodingRelease => 1,
@@ -150,6 +154,7 @@ impl Case {
             Self::Video => video::run(meter),
             Self::Depth => depth::run(meter, 32),
             Self::DepthShort => depth::run(meter, 8),
+            Self::MgetShort => mget::run(meter, Size::LAPTOP_SMALL, 2, 128),
             Self::MgetTiny => mget::run(meter, mget::TINY, 8, 256),
             Self::MgetBase => mget::run(meter, mget::BASE, 1, 1024),
             Self::Packing => mget::packing(meter),

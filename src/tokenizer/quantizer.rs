@@ -14,6 +14,7 @@ use rand::seq::index;
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
+use crate::engine::ops::Norm;
 use crate::engine::parameters::to_host;
 use crate::engine::{Initialise, Parameter, Reading, ops, parameters};
 use crate::random::{StreamRng, stream};
@@ -80,6 +81,10 @@ pub struct Assignment {
 
 /// An assignment, where its latents were computed.
 #[derive(Debug, Clone)]
+#[expect(
+    clippy::large_enum_variant,
+    reason = "one a micro-batch; a box would only be another place to look"
+)]
 pub enum Assigned {
     /// On the processor.
     Host(Assignment),
@@ -184,8 +189,8 @@ impl Quantizer {
     }
 
     /// Moves the codes after a step, whose micro-batches were assigned like this; gives how many were replaced. Where all are on a device
-    /// nobody waits for it.
-    pub fn follow(&mut self, batches: Vec<Assigned>, seed: u64, step: u64) -> Reading {
+    /// nobody waits for it, and nothing changes where the `norm` of the step's gradient is there and not finite.
+    pub fn follow(&mut self, batches: Vec<Assigned>, norm: &Norm, seed: u64, step: u64) -> Reading {
         let mut on_device = Vec::new();
         for batch in &batches {
             if let Assigned::Device(batch) = batch {
@@ -193,7 +198,8 @@ impl Quantizer {
             }
         }
         if !batches.is_empty() && on_device.len() == batches.len() {
-            return self.update_on_device(&DeviceAssignment::joined(on_device), seed, step);
+            let batch = DeviceAssignment::joined(on_device);
+            return self.update_on_device(&batch, norm, seed, step);
         }
         let mut whole = Assignment {
             ids: Vec::new(),

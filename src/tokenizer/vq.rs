@@ -400,7 +400,7 @@ impl VqVae {
     fn total(&self, square: Tensor<2>, batch: &Batch) -> Tensor<1> {
         match self.settings.loss {
             Loss::Mse => square.mean(),
-            Loss::MaskedMse => square.sum() / batch.valid.max(1.0),
+            Loss::MaskedMse => ops::sum(square) / batch.valid.max(1.0),
         }
     }
 
@@ -456,7 +456,7 @@ impl VqVae {
             numbers: match numbers {
                 // In f64, where they are known.
                 Reading::Host(all) => Reading::Host(vec![all[1] + weight * all[2], all[1], all[2]]),
-                there => there,
+                there @ Reading::Device(_) => there,
             },
             loss,
             assigned,

@@ -14,6 +14,7 @@ use super::validation::Score;
 use crate::clip::Signal;
 use crate::engine::communicator::reduce::Reduction;
 use crate::engine::gradients::Complete;
+use crate::engine::ops::Norm;
 use crate::engine::parameters::to_host;
 use crate::engine::{Communicator, Cuts, Gradients, Parameters, Reading, Tensor};
 use crate::geometry::skeleton::HAND;
@@ -197,11 +198,11 @@ impl Objective for VqReconstruction {
         })
     }
 
-    fn finish_step(&mut self, traces: Vec<Assigned>, step: u64) -> Named {
+    fn finish_step(&mut self, traces: Vec<Assigned>, norm: &Norm, step: u64) -> Named {
         let quantizer = self.model.quantizer_mut();
         Named {
             names: vec!["codes/replaced".into()],
-            numbers: quantizer.follow(traces, self.seed, step),
+            numbers: quantizer.follow(traces, norm, self.seed, step),
         }
     }
 }

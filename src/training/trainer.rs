@@ -13,7 +13,7 @@ mod unread;
 pub use unread::{Found, Named};
 
 use self::ranks::{Ranks, ShareError, Told};
-use self::unread::Unread;
+use self::unread::{Micro, Unread};
 use super::optimizer::{AdamW, AdamWSettings, NotFinite};
 use super::schedule::{Schedule, ScheduleError};
 use super::settings::{Keep, SettingsError};
@@ -21,6 +21,7 @@ use super::source::DataError;
 use super::validation::Score;
 use crate::engine::cuts::backward_order;
 use crate::engine::gradients::Complete;
+use crate::engine::ops::Norm;
 use crate::engine::{EngineError, Gradients, Parameters, RankError, Weights};
 use crate::formats::ReadError;
 use crate::masking::MaskingError;
@@ -63,10 +64,10 @@ pub trait Objective {
         backward_order(self.module(), &[])
     }
 
-    /// What the step changes besides what the gradients did, after the optimizer; `step` is counted from 0. Returns further
-    /// numbers for the report.
-    fn finish_step(&mut self, traces: Vec<Self::Trace>, step: u64) -> Named {
-        let _ = (traces, step);
+    /// What the step changes besides what the gradients did, after the optimizer; `step` is counted from 0. Where a device has the
+    /// `norm` of the gradients and it is not finite, nothing. Returns further numbers for the report.
+    fn finish_step(&mut self, traces: Vec<Self::Trace>, norm: &Norm, step: u64) -> Named {
+        let _ = (traces, norm, step);
         Named::none()
     }
 }
@@ -266,6 +267,9 @@ pub enum TrainingError {
     },
 }
 
+/// What was found in the micro-batches of a step, and the sum of their gradients where any asks for one.
+type Computed<T> = (Vec<Found<T>>, Option<Gradients>);
+
 impl<O: Objective> Trainer<O> {
     /// Starts to train, alone. `micro_batches` are the samples of each forward pass of a step.
     #[must_use]
@@ -353,7 +357,11 @@ impl<O: Objective> Trainer<O> {
                 let step = progress.step;
                 return Err(TrainingError::Loss { step, loss }.into());
             }
-            micros.push((found.numbers, found.parts, *share));
+            micros.push(Micro {
+                numbers: found.numbers,
+                parts: found.parts,
+                share: *share,
+            });
             traces.push(found.trace);
         }
         let learning_rate = self.schedule.rate(self.progress.step);
@@ -369,7 +377,7 @@ impl<O: Objective> Trainer<O> {
         if self.ranks.communicator().size() > 1 {
             self.ranks.note(norm.read());
         }
-        let further = self.objective.finish_step(traces, self.progress.step);
+        let further = (self.objective).finish_step(traces, &norm, self.progress.step);
         self.progress = progress;
         self.unread.push(Unread {
             micros,
@@ -386,7 +394,7 @@ impl<O: Objective> Trainer<O> {
         &self,
         count: usize,
         mut micro_step: impl FnMut(usize, Option<&mut Complete<'_>>) -> Result<Found<O::Trace>, E>,
-    ) -> Result<(Vec<Found<O::Trace>>, Option<Gradients>), E> {
+    ) -> Result<Computed<O::Trace>, E> {
         if self.ranks.communicator().size() == 1 {
             let (mut all, mut sum): (Vec<_>, Option<Gradients>) = (Vec::new(), None);
             for index in 0..count {

@@ -28,6 +28,7 @@ CASES = {
     "video": video.run,
     "depth": lambda repeats: depth.run(32, repeats),
     "depth-short": lambda repeats: depth.run(8, repeats),
+    "mget-short": lambda repeats: mget.run("short", repeats, "compile" in sys.argv),
     "mget-tiny": lambda repeats: mget.run("tiny", repeats, "compile" in sys.argv),
     "mget-base": lambda repeats: mget.run("base", repeats, "compile" in sys.argv),
     "decoding-fast": lambda repeats: decoding.run("fast", repeats),

@@ -1,4 +1,4 @@
-"""MGET: one training step and one forward pass, at two sizes."""
+"""MGET: one training step and one forward pass, at three sizes."""
 
 import math
 
@@ -9,9 +9,9 @@ from torch.nn import functional as F
 from measure import adamw, measure
 
 # Width, heads, depth.
-SIZES = {"tiny": (384, 6, 6), "base": (768, 12, 12)}
+SIZES = {"short": (96, 4, 2), "tiny": (384, 6, 6), "base": (768, 12, 12)}
 # Samples, and tokens on each side.
-BATCHES = {"tiny": (8, 256), "base": (1, 1024)}
+BATCHES = {"short": (2, 128), "tiny": (8, 256), "base": (1, 1024)}
 # Name, tokens, vocabulary.
 MODALITIES = [("body", 210, 2048), ("camera", 30, 256), ("depth", 5120, 64000), ("gaze", 30, 512), ("rgb", 5120, 64000)]
 

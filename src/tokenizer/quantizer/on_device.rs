@@ -7,6 +7,7 @@ use rand::RngExt;
 use rand::seq::index;
 
 use super::{Quantizer, QuantizerSettings};
+use crate::engine::ops::Norm;
 use crate::engine::{Parameter, Reading};
 use crate::random::stream;
 
@@ -98,8 +99,15 @@ impl Quantizer {
     }
 
     /// As [`Quantizer::update`] after [`Quantizer::sums`], of latents on a device; gives how many codes were replaced. Which latents replace
-    /// them is drawn otherwise than on the host, since nobody there knows how many are needed. Latents that are not finite change nothing.
-    pub fn update_on_device(&mut self, batch: &DeviceAssignment, seed: u64, step: u64) -> Reading {
+    /// them is drawn otherwise than on the host, since nobody there knows how many are needed. Nothing changes where the device has the `norm`
+    /// of the step's gradient, and it is not finite.
+    pub fn update_on_device(
+        &mut self,
+        batch: &DeviceAssignment,
+        norm: &Norm,
+        seed: u64,
+        step: u64,
+    ) -> Reading {
         let QuantizerSettings {
             codebook: codes,
             code_width: width,
@@ -108,7 +116,6 @@ impl Quantizer {
             ..
         } = self.settings;
         let [n_K1, sums_KL] = self.sums_on_device(batch);
-        let finite = sums_KL.clone().sum().is_finite();
         let old_K1 = self.state.cluster_size.reshaped([codes, 1]);
         let old_KL = self.state.embed.tensor::<2>();
         let counts_K1 = old_K1.clone() * decay + n_K1.clone() * (1.0 - decay);
@@ -126,9 +133,12 @@ impl Quantizer {
         let fresh_KL = batch.unit_ML.clone().select(0, rows.select(0, place_K));
         let codes_KL = moved_KL.mask_where(dead_K1.clone().expand([codes, width]), fresh_KL);
 
-        let keep = |new: Tensor<2>, old: Tensor<2>| {
-            let finite = finite.clone().reshape([1, 1]).expand(old.dims());
-            old.mask_where(finite, new)
+        let keep = |new: Tensor<2>, old: Tensor<2>| match norm {
+            Norm::Host(_) => new,
+            Norm::Device(norm) => {
+                let finite = norm.clone().is_finite().reshape([1, 1]);
+                old.clone().mask_where(finite.expand(old.dims()), new)
+            }
         };
         put(&mut self.state.cluster_size, keep(counts_K1, old_K1));
         put(&mut self.state.embed, keep(codes_KL, old_KL));
@@ -182,6 +192,10 @@ mod tests {
         Tensor::from_data(data, compute.device())
     }
 
+    fn norm(value: f32, compute: &Compute) -> Norm {
+        Norm::Device(Tensor::from_floats([value], compute.device()))
+    }
+
     fn close(found: &[f32], expected: &[f32]) -> bool {
         found.len() == expected.len()
             && found
@@ -204,7 +218,7 @@ mod tests {
                 let ids: Vec<i64> = found.ids.to_data().iter::<i64>().collect();
                 let expected: Vec<i64> = expected.ids.iter().map(|id| i64::from(*id)).collect();
                 assert_eq!(ids, expected);
-                let replaced = there.update_on_device(&found, 1, step);
+                let replaced = there.update_on_device(&found, &norm(1.0, &compute), 1, step);
                 assert_eq!(replaced.read(), [0.0]);
                 assert!(close(&there.counts(), &here.counts()), "step {step}");
                 assert!(close(&there.codes(), &here.codes()), "step {step}");
@@ -218,7 +232,7 @@ mod tests {
             let mut quantizer = quantizer(&compute, 2.0);
             let (codes, batch) = quantizer.assign_on_device(tensor(&latents(30, 0.0), &compute));
             assert_eq!(codes.dims(), [30, 4]);
-            let replaced = quantizer.update_on_device(&batch, 3, 7);
+            let replaced = quantizer.update_on_device(&batch, &Norm::Host(1.0), 3, 7);
             assert_eq!(replaced.read(), [12.0]);
             let pool = crate::engine::parameters::to_host(batch.unit_ML.clone());
             let codes = quantizer.codes();
@@ -228,20 +242,23 @@ mod tests {
             }
             // A few latents for many codes are taken again.
             let (_, few) = quantizer.assign_on_device(tensor(&latents(5, 1.0), &compute));
-            assert_eq!(quantizer.update_on_device(&few, 3, 8).read(), [12.0]);
+            assert_eq!(
+                quantizer
+                    .update_on_device(&few, &Norm::Host(1.0), 3, 8)
+                    .read(),
+                [12.0]
+            );
         }
     }
 
     #[test]
-    fn latents_that_are_not_finite_change_nothing() {
+    fn a_gradient_that_is_not_finite_changes_nothing() {
         for compute in devices() {
             let mut quantizer = quantizer(&compute, 2.0);
             let before = (quantizer.counts(), quantizer.codes());
+            let (_, batch) = quantizer.assign_on_device(tensor(&latents(30, 0.0), &compute));
             for bad in [f32::NAN, f32::INFINITY] {
-                let mut values = latents(30, 0.0);
-                values[13] = bad;
-                let (_, batch) = quantizer.assign_on_device(tensor(&values, &compute));
-                let _ = quantizer.update_on_device(&batch, 0, 0);
+                let _ = quantizer.update_on_device(&batch, &norm(bad, &compute), 0, 0);
                 assert!((quantizer.counts(), quantizer.codes()) == before, "{bad}");
             }
         }

@@ -12,7 +12,7 @@ use burn::tensor::Tensor;
 use super::VideoTokenizer;
 use crate::clip::Signal;
 use crate::engine::parameters::to_host;
-use crate::engine::{Cuts, Parameters, Values, Weights};
+use crate::engine::{Cuts, Parameters, Values, Weights, ops};
 use crate::tokenizer::TokenizerError;
 use crate::tokenizer::normaliser::Normaliser;
 use crate::tokenizer::whitening::{Whitening, floats, scale};
@@ -101,7 +101,7 @@ pub(super) fn unevenness(z: Tensor<2>) -> Tensor<1> {
     let centred = z - mean.clone();
     let covariance = centred.clone().transpose().matmul(centred) / rows as f64;
     let white = Tensor::<2>::eye(width, &mean.device()) * (SPREAD * SPREAD);
-    (covariance - white).square().sum() + mean.square().sum()
+    ops::sum((covariance - white).square()) + ops::sum(mean.square())
 }
 
 /// Makes the first and last convolutions of encoder and decoder look mostly at the pixel itself, with the variance they had.

@@ -196,7 +196,7 @@ impl VideoTokenizer {
         let offset: Tensor<2> = codes - soft.clone().without_autodiff();
         let found = self.pixels(soft + offset, samples, cuts);
         let (kept, count) = self.kept(samples);
-        let loss = ((found - blocks).square() * kept).sum() / count;
+        let loss = ops::sum((found - blocks).square() * kept) / count;
         Ok(Trained { loss, unevenness })
     }
 

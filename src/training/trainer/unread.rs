@@ -78,11 +78,21 @@ impl Named {
     }
 }
 
+/// What is left of a micro-batch.
+#[derive(Debug, Clone)]
+pub(super) struct Micro {
+    /// As [`Found::numbers`].
+    pub(super) numbers: Reading,
+    /// As [`Found::parts`].
+    pub(super) parts: Vec<(String, f64)>,
+    /// Its share of the step.
+    pub(super) share: f64,
+}
+
 /// A step that was taken.
 #[derive(Debug, Clone)]
 pub(super) struct Unread {
-    /// The numbers of each micro-batch, its parts and its share of the step.
-    pub(super) micros: Vec<(Reading, Vec<(String, f64)>, f64)>,
+    pub(super) micros: Vec<Micro>,
     pub(super) norm: Reading,
     /// What the step changed besides.
     pub(super) further: Named,
@@ -92,7 +102,7 @@ pub(super) struct Unread {
 
 impl Unread {
     fn readings(&self) -> impl Iterator<Item = &Reading> {
-        let micros = self.micros.iter().map(|(numbers, ..)| numbers);
+        let micros = self.micros.iter().map(|micro| &micro.numbers);
         micros.chain([&self.norm, &self.further.numbers])
     }
 
@@ -122,14 +132,14 @@ impl Unread {
         let mut next = || read.next().unwrap_or_default().into_iter();
         let step = self.progress.step;
         let (mut loss, mut parts) = (0.0, Vec::new());
-        for (_, names, share) in self.micros {
+        for micro in self.micros {
             let mut numbers = next();
             let own = numbers.next().unwrap_or_default();
             if !own.is_finite() {
                 return Err(TrainingError::Loss { step, loss: own });
             }
-            loss += own * share;
-            let means = names.into_iter().zip(numbers);
+            loss += own * micro.share;
+            let means = micro.parts.into_iter().zip(numbers);
             add(
                 &mut parts,
                 means.map(|((name, weight), mean)| (name, mean, weight)),

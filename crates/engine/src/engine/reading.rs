@@ -10,6 +10,10 @@ use super::parameters::to_host;
 
 /// Some numbers, where they are.
 #[derive(Debug, Clone)]
+#[expect(
+    clippy::large_enum_variant,
+    reason = "a few a step; a box would only be another place to look"
+)]
 pub enum Reading {
     /// On the processor: known.
     Host(Vec<f64>),

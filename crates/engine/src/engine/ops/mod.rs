@@ -283,6 +283,31 @@ pub fn resize(x: Tensor<2>, resize: Resize) -> Tensor<2> {
     unfused::resize(x, resize)
 }
 
+/// Elements that are added up at a time where all of an array are.
+const SUMMED: usize = 1024;
+
+/// The sum of all elements, `[1]`. On a device it has a fixed order; the library's own adds up in the order in which units end, and
+/// has other bits each time.
+#[must_use]
+pub fn sum<const D: usize>(x: Tensor<D>) -> Tensor<1> {
+    if fused::takes(&x) {
+        return x.sum();
+    }
+    let mut length = x.shape().num_elements();
+    let mut flat: Tensor<1> = x.reshape([length]);
+    while length > SUMMED {
+        let (rows, rest) = (length / SUMMED, length % SUMMED);
+        let whole = flat.clone().narrow(0, 0, rows * SUMMED);
+        let mut parts = vec![whole.reshape([rows, SUMMED]).sum_dim(1).reshape([rows])];
+        if rest > 0 {
+            parts.push(flat.narrow(0, rows * SUMMED, rest));
+        }
+        flat = Tensor::cat(parts, 0);
+        length = rows + rest;
+    }
+    flat.reshape([1, length]).sum_dim(1).reshape([1])
+}
+
 /// The rows `ids` of `table` `[V, D]`: `[N, D]`.
 #[must_use]
 pub fn embedding(table: Tensor<2>, ids: &[u32]) -> Tensor<2> {
@@ -339,7 +364,7 @@ impl Norm {
         if device.is_empty() {
             return Self::Host(host.sqrt());
         }
-        Self::Device(Tensor::cat(device, 0).sum().sqrt())
+        Self::Device(sum(Tensor::cat(device, 0)).sqrt())
     }
 
     /// What is known without waiting.

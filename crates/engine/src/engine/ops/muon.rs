@@ -3,7 +3,7 @@
 
 use burn::tensor::Tensor;
 
-use super::{Norm, fused, linear};
+use super::{Norm, fused, linear, sum};
 
 /// How much of the momentum is kept from step to step.
 pub(super) const MOMENTUM: f64 = 0.95;
@@ -109,7 +109,7 @@ fn orthogonal(x: Tensor<2>) -> Tensor<2> {
     let [rows, columns] = x.dims();
     let tall = rows > columns;
     let x = if tall { x.transpose() } else { x };
-    let norm = x.clone().square().sum().sqrt() + NORM_EPSILON;
+    let norm = sum(x.clone().square()).sqrt() + NORM_EPSILON;
     let mut x = x / norm.reshape([1, 1]);
     let [a, b, c] = COEFFICIENTS;
     for _ in 0..ROUNDS {

@@ -175,7 +175,7 @@ fn along(x: Tensor<3>, steps: &[Step]) -> Tensor<3> {
 }
 
 pub fn sum_of_squares(x: Tensor<1>) -> Tensor<1> {
-    x.square().sum()
+    super::sum(x.square())
 }
 
 pub fn adamw(

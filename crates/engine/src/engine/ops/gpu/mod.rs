@@ -485,6 +485,15 @@ mod tests {
     }
 
     #[test]
+    fn a_sum_has_the_same_bits_each_time_and_gradients_of_ones() {
+        for length in [1, 1024, 1025, 3_000_001] {
+            assert_alike("sum", &[[1, length]], &|x| {
+                ops::sum(x[0].clone() + 0.5).unsqueeze()
+            });
+        }
+    }
+
+    #[test]
     fn the_norm_of_arrays_on_the_device_is_that_of_the_processor() {
         let Some(gpu) = gpu() else { return };
         let arrays = |device: &Device| {

@@ -63,5 +63,7 @@ pub fn sum_of_squares(x: burn::tensor::Tensor<1>) -> burn::tensor::Tensor<1> {
             UNITS as usize,
         );
     }
-    burn::tensor::Tensor::<1>::from_primitive::<CubeBackend>(sums).sum()
+    super::super::sum(burn::tensor::Tensor::<1>::from_primitive::<CubeBackend>(
+        sums,
+    ))
 }
