@@ -6,7 +6,7 @@ use super::batch::{Batch, EncoderInput};
 use super::loss::{Loss, Losses};
 use super::model::{Mget, decoder_segments};
 use crate::engine::gradients::Complete;
-use crate::engine::{Gradients, Parameters, Segments, Tensor};
+use crate::engine::{Gradients, Parameters, Segments, Tensor, ops};
 
 impl Mget {
     /// The losses of a batch, and the gradients of `share` times their total; `None` when there is no target or the total is not
@@ -59,7 +59,7 @@ impl Mget {
             let y_MD = leaf(input_MD);
             let context_ND = context_ND.as_ref().map(leaf);
             let out_MD = block.forward(y_MD.clone(), context_ND.as_ref(), &own_modality, &visible);
-            let slope = (out_MD * dy_MD).sum();
+            let slope = ops::slope(out_MD, dy_MD);
             if let Some(context_ND) = context_ND {
                 let [dy, dcontext] = gradients.add(&slope, self, [&y_MD, &context_ND]);
                 dy_MD = dy;
@@ -72,21 +72,21 @@ impl Mget {
             }
             gradients.close_item("decoder", index, block, complete);
         }
-        let [] = gradients.add(&(self.decoder_queries(targets) * dy_MD).sum(), self, []);
+        let [] = gradients.add(&ops::slope(self.decoder_queries(targets), dy_MD), self, []);
 
         if let (Some(dcontext_ND), Some(h_ND)) = (dcontext_ND, encoder.last().map(leaf)) {
             let positional_ND = self
                 .encoder_embeddings
                 .positional_embedding(&batch.visible.sequence);
             let context_ND = self.context(self.encoder_norm.forward(h_ND.clone()), positional_ND);
-            let [mut dh_ND] = gradients.add(&(context_ND * dcontext_ND).sum(), self, [&h_ND]);
+            let [mut dh_ND] = gradients.add(&ops::slope(context_ND, dcontext_ND), self, [&h_ND]);
             gradients.close("encoder_norm", &self.encoder_norm, complete);
             gradients.close("decoder_proj_context", &self.decoder_proj_context, complete);
             let samples = Segments::within(&batch.visible.sequence.lengths);
             for (index, (block, input_ND)) in self.encoder.iter().zip(&encoder).enumerate().rev() {
                 let h_ND = leaf(input_ND);
                 let out_ND = block.forward(h_ND.clone(), &samples);
-                [dh_ND] = gradients.add(&(out_ND * dh_ND).sum(), self, [&h_ND]);
+                [dh_ND] = gradients.add(&ops::slope(out_ND, dh_ND), self, [&h_ND]);
                 gradients.close_item("encoder", index, block, complete);
             }
             // Anew: backward has consumed the graph of the first.
@@ -94,7 +94,7 @@ impl Mget {
                 .encoder_embeddings
                 .positional_embedding(&batch.visible.sequence);
             let input_ND = self.input_embedding(&batch.visible, positional_ND);
-            let [] = gradients.add(&(input_ND * dh_ND).sum(), self, []);
+            let [] = gradients.add(&ops::slope(input_ND, dh_ND), self, []);
         }
         gradients.close("", self, complete);
         (found, Some(gradients))

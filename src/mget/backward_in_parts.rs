@@ -7,7 +7,7 @@ use super::batch::Batch;
 use super::loss::{Loss, Losses};
 use super::model::{Mget, decoder_segments};
 use crate::engine::gradients::Complete;
-use crate::engine::{Gradients, Parameters, Segments, Tensor};
+use crate::engine::{Gradients, Parameters, Segments, Tensor, ops};
 
 /// A part of the graph: what went in, cut off from where it came from, and what came out.
 struct Part {
@@ -79,7 +79,7 @@ impl Mget {
         gradients.close("decoder_embeddings", &self.decoder_embeddings, complete);
         let mut dcontext_ND: Option<Tensor<2>> = None;
         for (index, (block, part)) in self.decoder.iter().zip(decoder).enumerate().rev() {
-            let slope = (part.output * dy_MD).sum();
+            let slope = ops::slope(part.output, dy_MD);
             if let Some(context_ND) = &context_ND {
                 let [dy, dcontext] = gradients.add(&slope, self, [&part.input, context_ND]);
                 dy_MD = dy;
@@ -92,7 +92,7 @@ impl Mget {
             }
             gradients.close_item("decoder", index, block, complete);
         }
-        let [] = gradients.add(&(queries_MD * dy_MD).sum(), self, []);
+        let [] = gradients.add(&ops::slope(queries_MD, dy_MD), self, []);
         if let (Some(graph), Some(dcontext_ND)) = (encoder, dcontext_ND) {
             self.encoder_gradients(graph, dcontext_ND, &mut gradients, complete);
         }
@@ -161,19 +161,19 @@ impl Mget {
         complete: &mut Complete<'_>,
     ) {
         let cut_positional_ND = &graph.cut_positional_ND;
-        let slope = (graph.context.output * dcontext_ND).sum();
+        let slope = ops::slope(graph.context.output, dcontext_ND);
         let inputs = [&graph.context.input, cut_positional_ND];
         let [mut dh_ND, from_context_ND] = gradients.add(&slope, self, inputs);
         gradients.close("encoder_norm", &self.encoder_norm, complete);
         gradients.close("decoder_proj_context", &self.decoder_proj_context, complete);
         for (index, (block, part)) in self.encoder.iter().zip(graph.blocks).enumerate().rev() {
-            [dh_ND] = gradients.add(&(part.output * dh_ND).sum(), self, [&part.input]);
+            [dh_ND] = gradients.add(&ops::slope(part.output, dh_ND), self, [&part.input]);
             gradients.close_item("encoder", index, block, complete);
         }
-        let slope = (graph.input_ND * dh_ND).sum();
+        let slope = ops::slope(graph.input_ND, dh_ND);
         let [from_input_ND] = gradients.add(&slope, self, [cut_positional_ND]);
         let dpositional_ND = from_input_ND + from_context_ND;
-        let [] = gradients.add(&(graph.positional_ND * dpositional_ND).sum(), self, []);
+        let [] = gradients.add(&ops::slope(graph.positional_ND, dpositional_ND), self, []);
     }
 }
 

@@ -7,6 +7,7 @@
 use burn::tensor::Tensor;
 
 use super::gradients::{Complete, Gradients};
+use super::ops;
 use super::parameters::Parameters;
 
 /// Where a forward pass was cut.
@@ -82,7 +83,7 @@ impl Cuts {
                     };
                 }
             }
-            slope = slopes[index].take().map(|slope| (cut.end * slope).sum());
+            slope = slopes[index].take().map(|slope| ops::slope(cut.end, slope));
         }
         if let Some(slope) = slope {
             gradients.add_part(&slope, model, &[], complete);

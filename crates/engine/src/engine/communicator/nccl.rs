@@ -65,7 +65,7 @@ impl Nccl {
         compute: &Compute,
     ) -> Result<Self, String> {
         let id: Vec<c_char> = id.iter().map(|byte| *byte as c_char).collect();
-        let internal = id.try_into().map_err(|_| "rank 0 sent no identifier")?;
+        let internal: [c_char; 128] = id.try_into().map_err(|_| "rank 0 sent no identifier")?;
         let device = match compute.device().as_dispatch() {
             DispatchDevice::Cube(CubeDevice::Cuda(device)) => device.index,
             _ => return Err("it computes on no GPU of NVIDIA".to_owned()),

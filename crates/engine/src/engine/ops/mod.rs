@@ -58,6 +58,16 @@ fn check_targets(targets: &[u32], [rows, classes]: [usize; 2]) {
     );
 }
 
+/// A number from which backward begins in the middle of a graph: its gradient in `output` is `slope`, an array of the same shape that
+/// has no gradient. What the number is does not matter.
+#[must_use]
+pub fn slope(output: Tensor<2>, slope: Tensor<2>) -> Tensor<1> {
+    if fused::takes(&output) {
+        return fused::run(Fused::Slope, output, Some(slope), NONE);
+    }
+    (output * slope).sum()
+}
+
 /// `x W^T + b`; `x` is `[N, in]`, `weight` `[out, in]`.
 #[must_use]
 pub fn linear(x: Tensor<2>, weight: Tensor<2>, bias: Option<Tensor<1>>) -> Tensor<2> {

@@ -14,6 +14,7 @@ mod layer_norm;
 mod linear;
 mod muon;
 mod resize;
+mod slope;
 
 use std::mem::MaybeUninit;
 use std::sync::Arc;
@@ -115,6 +116,7 @@ pub enum Fused {
     Convolution { taps: ConvWindow },
     FrameNorm { frames: usize, silu: bool },
     Resize { resize: Resize },
+    Slope,
 }
 
 impl Fused {
@@ -137,6 +139,7 @@ impl Fused {
                 silu: *silu,
             }),
             Self::Resize { resize } => run(&resize::Bilinear { resize: *resize }),
+            Self::Slope => run(&slope::Slope),
         }
     }
 }
