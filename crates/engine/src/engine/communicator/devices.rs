@@ -3,15 +3,8 @@
 use super::reduce::Reduction;
 use super::{Communicator, RankError};
 use crate::engine::Compute;
-use burn::tensor::Tensor;
 #[cfg(feature = "cuda")]
 use std::sync::Arc;
-
-/// What adds up arrays of devices without the host. Every rank makes the same calls in the same order.
-pub(crate) trait DeviceLink: Send + Sync {
-    /// The sum over ranks of equally long arrays, each on the device of its rank.
-    fn sum(&self, values: Tensor<1>) -> Result<Tensor<1>, RankError>;
-}
 
 impl Communicator {
     /// The same ranks for a training on this device: where all of them compute on GPUs of NVIDIA and have NCCL, gradients are added

@@ -20,6 +20,7 @@ pub mod shard;
 mod threads;
 pub mod watch;
 
+use burn::tensor::Tensor;
 use serde::{Serialize, de::DeserializeOwned};
 use std::cell::RefCell;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -72,6 +73,12 @@ pub(crate) trait Link: Send + Sync {
     fn abort(&self, code: i32);
 }
 
+/// What adds up arrays of devices without the host. Every rank makes the same calls in the same order.
+pub(crate) trait DeviceLink: Send + Sync {
+    /// The sum over ranks of equally long arrays, each on the device of its rank.
+    fn sum(&self, values: Tensor<1>) -> Result<Tensor<1>, RankError>;
+}
+
 /// What a link is about to have.
 pub(crate) enum Pending<T> {
     Ready(Result<T, RankError>),
@@ -101,7 +108,7 @@ impl<T> Pending<T> {
 pub struct Communicator {
     link: Option<Arc<dyn Link>>,
     /// What adds up arrays without the host, where there is such a thing.
-    devices: Option<Arc<dyn devices::DeviceLink>>,
+    devices: Option<Arc<dyn DeviceLink>>,
     /// A failure that every rank has heard of, and that [`Communicator::settle`] has not cleared yet.
     failed: Arc<AtomicBool>,
 }

@@ -3,8 +3,7 @@
 //! NCCL is loaded when it is asked for; neither this build nor a machine without it knows of it. Its sums have the order that it
 //! chooses for the machine: the same bytes from run to run on the same GPUs, as NVIDIA says, and not those of the processor.
 
-use super::RankError;
-use super::devices::DeviceLink;
+use super::{DeviceLink, RankError};
 use crate::engine::Compute;
 use burn::backend::{CubeDevice, DispatchDevice};
 use burn::tensor::Tensor;

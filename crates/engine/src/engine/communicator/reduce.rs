@@ -9,8 +9,7 @@
 //!
 //! Where devices add up arrays among themselves ([`super::devices`]), a bucket stays on them; their library chooses the order.
 
-use super::devices::DeviceLink;
-use super::{Communicator, Link, RankError};
+use super::{Communicator, DeviceLink, Link, RankError};
 use crate::engine::{Gradients, Parameters, parameters::to_host};
 use burn::tensor::{Device, Tensor, TensorData};
 use schemars::JsonSchema;
