@@ -263,7 +263,7 @@ impl Sum {
         model.visit("", &mut |name, _| {
             if let Some(place) = self.places.get(name) {
                 let sum = all[place.bucket].clone();
-                let sum = sum.slice([place.start..place.start + place.length]);
+                let sum = sum.narrow(0, place.start, place.length);
                 gradients.insert(name.to_owned(), sum);
             }
         });
