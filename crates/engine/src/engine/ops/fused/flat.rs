@@ -11,18 +11,19 @@ use super::{Array, vector};
 /// Elements per task.
 const ELEMENTS: usize = 16 * 1024;
 
-pub(super) fn host(tensor: Tensor<1>) -> FlexTensor {
+fn flex(tensor: Tensor<1>) -> FlexTensor {
     tensor
         .try_into_primitive::<Flex>()
         .expect("the front door lets only arrays of the CPU in")
-        .to_contiguous()
+}
+
+pub(super) fn host(tensor: Tensor<1>) -> FlexTensor {
+    flex(tensor).to_contiguous()
 }
 
 /// An array to be read; it may be a part of another.
 fn read(tensor: Tensor<1>) -> Array {
-    let tensor = tensor
-        .try_into_primitive::<Flex>()
-        .expect("the front door lets only arrays of the CPU in");
+    let tensor = flex(tensor);
     if tensor.is_contiguous() {
         Array(tensor)
     } else {
