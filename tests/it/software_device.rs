@@ -3,14 +3,13 @@
 //!
 //! `cargo test --release --features wgpu --test it software_device`; without such a device the tests skip, and say so.
 
-use crate::run_text::{failures, run_text};
+use crate::run_text::artifacts;
 use crate::training::Setup;
 use reviv::engine::{
     Compute, DeviceChoice, DeviceKind, Initialise, Parameters, Precision, Weights,
 };
 use reviv::mget::Mget;
 use reviv::modality::Shape;
-use reviv::run::{Cache, State};
 use reviv::tokenizer::trained::Prepared;
 use reviv::tokenizer::video::{Network, VideoSettings, VideoTokenizer};
 use reviv::tokenizer::vq::{VqSettings, VqVae};
@@ -112,22 +111,10 @@ type Made = BTreeMap<String, (PathBuf, Value)>;
 fn made(folder: &Path, [tokenizers, mget, used]: [&str; 3]) -> Made {
     let text = EXPERIMENT.replace("TOKENIZERS", tokenizers);
     let text = text.replace("MGET", mget).replace("USE", used);
-    let outcome = run_text(folder, &text).unwrap_or_else(|report| panic!("{report}"));
-    assert_eq!(outcome.state, State::Done, "{:?}", failures(&outcome));
-    let mut made = Made::new();
-    for leaf in Cache::of(&folder.join("runs")).entries().unwrap() {
-        let Ok(text) = std::fs::read_to_string(leaf.path.join("manifest.json")) else {
-            continue;
-        };
-        let manifest: Value = serde_json::from_str(&text).unwrap();
-        let contents = manifest["contents"].clone();
-        let op = manifest["recipe"]["op"].as_str().unwrap_or_default();
-        let modality = contents["modality"].as_str().unwrap_or_default();
-        made.insert(
-            format!("{op} {modality}").trim().to_owned(),
-            (leaf.path, contents),
-        );
-    }
+    let made: Made = artifacts(folder, &text)
+        .into_iter()
+        .map(|(name, path, contents)| (name.trim().to_owned(), (path, contents)))
+        .collect();
     assert_eq!(made.len(), 9, "{:?}", made.keys());
     made
 }

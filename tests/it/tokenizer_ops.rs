@@ -1,12 +1,8 @@
 //! `op: train_tokenizer` and `op: tokenize` as an experiment runs them: from clips of the built-in world to token shards.
 
-use crate::run_text::{failures, run_text};
+use crate::run_text::{artifacts, run_text};
 use reviv::mget::{MgetSpec, ModalitySpec, Positions, Size};
-use reviv::run::Cache;
-use reviv::run::State;
 use reviv::training::{TokenShards, TokenSource};
-use serde_json::Value;
-use std::path::{Path, PathBuf};
 
 const EXPERIMENT: &str = "
 experiment: tokens_of_a_tiny_world
@@ -49,28 +45,10 @@ stages:
     pixels: rgb
 ";
 
-/// Runs the experiment; gives every artifact by its op and modality.
-fn run(folder: &Path, experiment: &str) -> Vec<(String, PathBuf, Value)> {
-    let outcome = run_text(folder, experiment).unwrap_or_else(|report| panic!("{report}"));
-    assert_eq!(outcome.state, State::Done, "{:?}", failures(&outcome));
-    let mut artifacts = Vec::new();
-    for leaf in Cache::of(&folder.join("runs")).entries().unwrap() {
-        let Ok(text) = std::fs::read_to_string(leaf.path.join("manifest.json")) else {
-            continue;
-        };
-        let manifest: Value = serde_json::from_str(&text).unwrap();
-        let contents = manifest["contents"].clone();
-        let op = manifest["recipe"]["op"].as_str().unwrap_or_default();
-        let modality = contents["modality"].as_str().unwrap_or_default();
-        artifacts.push((format!("{op} {modality}"), leaf.path, contents));
-    }
-    artifacts
-}
-
 #[test]
 fn clips_become_tokens_that_the_model_reads_and_the_tokenizer_decodes() {
     let folder = tempfile::tempdir().unwrap();
-    let artifacts = run(folder.path(), EXPERIMENT);
+    let artifacts = artifacts(folder.path(), EXPERIMENT);
     let of = |name: &str| {
         artifacts
             .iter()
@@ -186,7 +164,7 @@ stages:
 #[test]
 fn tokenizers_train_on_a_mixture_and_are_scored_on_all_of_it() {
     let folder = tempfile::tempdir().unwrap();
-    let artifacts = run(folder.path(), MIXTURE);
+    let artifacts = artifacts(folder.path(), MIXTURE);
     let contents = |op: &str| {
         let found = artifacts.iter().find(|(name, _, _)| name == op);
         found.unwrap_or_else(|| panic!("{op}")).2.clone()
